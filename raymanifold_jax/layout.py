@@ -1,0 +1,289 @@
+"""How a scene lies in memory for the sweeps: the padded lattice, mirror images, and which element reads which voxel.
+
+The *padded* lattice has one ghost voxel around every axis that is not periodic. Mirror sides are unfolded: the lattice is
+doubled along their axis, only directions on one side of the mirror are swept, and results are folded back. For each sweep
+axis the elements' *reads* are listed plane by plane, in tiles of equal size, so that one small loop serves any number of
+elements in a plane.
+
+Public: `Layout`, `make_layout`, `Ordinates`, `make_ordinates`.
+"""
+
+from __future__ import annotations
+
+import itertools
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, UInt32
+
+from .quadrature import Quadrature
+from .scene import MIRROR, Scene
+from .surfaces import Surfaces
+
+AXES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # sweep axis, u, v
+_CHUNK = 16  # directions times bands in one step: fits a CPU's second-level cache
+
+
+class Unfolding(eqx.Module):
+    """Mirror sides, axis by axis, as blocks of the lattice that are copies (False) or reflections (True) of it."""
+
+    blocks: tuple[tuple[bool, ...], ...] = eqx.field(static=True)
+
+    @property
+    def axes(self) -> tuple[int, ...]:
+        return tuple(axis for axis in range(3) if len(self.blocks[axis]) > 1)
+
+    def unfold(self, field: Float[Array, "C nx ny nz"]) -> Float[Array, "C X Y Z"]:
+        for axis in self.axes:
+            parts = [jnp.flip(field, axis + 1) if mirrored else field for mirrored in self.blocks[axis]]
+            field = jnp.concatenate(parts, axis + 1)
+        return field
+
+    def fold(self, field: Float[Array, "C X Y Z"]) -> Float[Array, "C nx ny nz"]:
+        """Sum over the images: the transpose of `unfold`."""
+        for axis in self.axes:
+            parts = jnp.split(field, len(self.blocks[axis]), axis + 1)
+            field = sum(jnp.flip(p, axis + 1) if m else p for p, m in zip(parts, self.blocks[axis], strict=True))
+        return field
+
+    def images(self) -> list[tuple[tuple[int, ...], np.ndarray]]:
+        """Every image: its block number along each axis, and the signs (3,) it gives to directions."""
+        numbers = itertools.product(*(range(len(b)) for b in self.blocks))
+        return [(n, np.array([-1 if self.blocks[a][n[a]] else 1 for a in range(3)])) for n in numbers]
+
+
+class Reads(eqx.Module):
+    """Which element reads which voxel during the sweeps along one axis; rows sorted by plane, padded to whole tiles."""
+
+    cell: Int[Array, " M"]  # voxel read, flat in its plane
+    element: Int[Array, " M"]
+    plane: Float[Array, "4 M"]  # the element's plane: offset, then the normal along (axis, u, v); padding: 0
+    home: Int[Array, "2 M"]  # the element's own voxel: its plane and its place in the plane
+    first_tile: Int[Array, " K1"]
+    tile: int = eqx.field(static=True)
+
+
+class AxisReads(NamedTuple):
+    """`hits`: rays that arrive at the element in its own voxel. `probes`: the paths in its probe voxel."""
+
+    hits: Reads
+    probes: Reads
+
+
+class Layout(eqx.Module):
+    """The padded, unfolded lattice of a scene and its surface elements on it. See the module's docstring."""
+
+    unfolding: Unfolding
+    shape: tuple[int, int, int] = eqx.field(static=True)  # the scene's lattice
+    padded: tuple[int, int, int] = eqx.field(static=True)
+    pad: tuple[int, int, int] = eqx.field(static=True)
+    spacing: float = eqx.field(static=True)
+    elements: int = eqx.field(static=True)
+    plane: Float[Array, "4 X Y Z"]  # offset and normal of each voxel's surface; free: 1, 0; ghosts: -1, 0
+    cell: Int[Array, " I"]  # voxel of each element image, flat in the padded lattice
+    source_element: Int[Array, " I"]
+    share: Float[Array, " I"]  # its share of that voxel's exitance
+    buried: Bool[Array, "X Y Z"]  # voxels wholly inside solids
+    inflow_image: Int[Array, "X Y Z"]  # which mirror image an open ghost voxel belongs to; -1: not open
+    reads: tuple[AxisReads, AxisReads, AxisReads]
+
+    def to_padded(self, field: Float[Array, "C nx ny nz"]) -> Float[Array, "C X Y Z"]:
+        """Unfold a field of the scene's lattice and give it ghost voxels (0)."""
+        return jnp.pad(self.unfolding.unfold(field), ((0, 0), *((p, p) for p in self.pad)))
+
+    def from_padded(self, field: Float[Array, "C X Y Z"]) -> Float[Array, "C nx ny nz"]:
+        inner = tuple(slice(p, n - p) for p, n in zip(self.pad, self.padded, strict=True))
+        return self.unfolding.fold(field[(slice(None), *inner)])
+
+    def exitance_field(self, exitance: Float[Array, "C E"]) -> Float[Array, "C X Y Z"]:
+        """Each voxel's exitant radiance: the mean over its elements, by area."""
+        values = exitance[:, self.source_element] * self.share
+        size = int(np.prod(self.padded))
+        flat = jnp.zeros((exitance.shape[0], size), exitance.dtype).at[:, self.cell].add(values)
+        return flat.reshape(-1, *self.padded)
+
+
+def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
+    lattice = scene.lattice
+    sides = scene.boundary.sides
+    unfolding = Unfolding(tuple(_blocks(sides[2 * a] is MIRROR, sides[2 * a + 1] is MIRROR) for a in range(3)))
+    both_mirrors = [sides[2 * a] is MIRROR and sides[2 * a + 1] is MIRROR for a in range(3)]
+    pad = tuple(0 if scene.boundary.periodic[a] or both_mirrors[a] else 1 for a in range(3))
+    shape = np.array(lattice.shape)
+    padded = shape * [len(b) for b in unfolding.blocks] + 2 * np.array(pad)
+
+    images = [_image(unfolding, number, signs, shape, pad, surfaces) for number, signs in unfolding.images()]
+    voxel, probe, normal = (np.concatenate([image[key] for image in images]) for key in ("voxel", "probe", "normal"))
+    element = np.tile(np.arange(len(surfaces)), len(images))
+    image_number = np.repeat(np.arange(len(images)), len(surfaces))
+    offset = surfaces.offset[element]
+    flat = np.ravel_multi_index(tuple(voxel.T), tuple(padded)) if len(voxel) else np.zeros(0, int)
+    size = int(np.prod(padded))
+
+    area = surfaces.area[element]
+    total = np.bincount(flat, area, size)
+    ghost = np.ones(padded, bool)
+    ghost[tuple(slice(p, n - p) for p, n in zip(pad, padded, strict=True))] = False
+    plane = _voxel_planes(flat, offset, normal, area, total, padded, ghost)
+    inflow = np.full(size, -1)
+    is_open = surfaces.open[element]
+    inflow[flat[is_open]] = image_number[is_open]
+    blocked = np.pad(
+        np.asarray(unfolding.unfold(jnp.asarray(surfaces.solid[None])))[0],
+        [(p, p) for p in pad],
+        constant_values=True,
+    )
+    periodic = [p == 0 for p in pad]
+    probe = np.where(periodic, probe % padded, np.clip(probe, 0, padded - 1))
+    probing = ~blocked[tuple(probe.T)]
+    rows = {"voxel": voxel, "element": element, "offset": offset, "normal": normal}
+    probes = {key: value[probing] for key, value in rows.items()}
+    real = np.dtype(jnp.zeros(0).dtype)
+    return Layout(
+        unfolding=unfolding,
+        shape=lattice.shape,
+        padded=tuple(int(n) for n in padded),
+        pad=pad,
+        spacing=lattice.spacing,
+        elements=len(surfaces),
+        plane=jnp.asarray(plane, real),
+        cell=jnp.asarray(flat, np.int32),
+        source_element=jnp.asarray(element, np.int32),
+        share=jnp.asarray(area / np.maximum(total[flat], 1e-300), real),
+        buried=jnp.asarray(blocked & ~ghost),
+        inflow_image=jnp.asarray(inflow.reshape(padded), np.int32),
+        reads=tuple(
+            AxisReads(_reads(axes, padded, rows, voxel, real), _reads(axes, padded, probes, probe[probing], real))
+            for axes in AXES
+        ),
+    )
+
+
+def _blocks(lower: bool, upper: bool) -> tuple[bool, ...]:
+    return {(False, False): (False,), (True, False): (True, False)}.get((lower, upper), (False, True))
+
+
+def _image(unfolding, number, signs, shape, pad, surfaces: Surfaces) -> dict[str, np.ndarray]:
+    """An image's voxels, probe voxels and normals on the padded lattice."""
+    start = np.array(number) * shape + pad
+    reflected = signs < 0
+    voxel = start + np.where(reflected, shape - 1 - surfaces.voxel, surfaces.voxel)
+    return {
+        "voxel": voxel,
+        "probe": voxel + (surfaces.probe - surfaces.voxel) * signs,
+        "normal": surfaces.normal * signs,
+    }
+
+
+def _voxel_planes(flat, offset, normal, area, total, padded, ghost) -> np.ndarray:
+    """The one plane that stands for a voxel's elements in the sweep: (4, X, Y, Z)."""
+    size = int(np.prod(padded))
+    plane = np.zeros((4, size))
+    weight = area / np.maximum(total[flat], 1e-300)
+    for row, values in enumerate((offset, *normal.T)):
+        plane[row] = np.bincount(flat, weight * values, size)
+    length = np.linalg.norm(plane[1:], axis=0)
+    plane /= np.where(length > 1e-6, length, 1.0)
+    plane[0, np.bincount(flat, minlength=size) == 0] = 1.0
+    # A voxel that solids fill up to its faces blocks every ray: so do convex edges of aligned boxes, and ghosts.
+    shallow = np.full(size, -np.inf)
+    np.maximum.at(shallow, flat, offset)
+    several = np.bincount(flat, minlength=size) > 1
+    filled = (several & (shallow < -0.4)).reshape(padded)
+    plane = plane.reshape(4, *padded)
+    plane[:, filled | ghost] = np.array([-1.0, 0.0, 0.0, 0.0])[:, None]
+    return plane
+
+
+def _reads(axes: tuple[int, int, int], padded: np.ndarray, rows: dict, voxel: np.ndarray, real) -> Reads:
+    axis, u, v = axes
+    planes = int(padded[axis])
+    order = np.argsort(voxel[:, axis], kind="stable")
+    count = np.bincount(voxel[:, axis], minlength=planes)
+    typical = np.median(count[count > 0]) if len(order) else 1
+    tile = int(np.clip(2 ** np.ceil(np.log2(max(typical, 1))), 64, 1024))
+    tiles = -(-count // tile)
+    first_tile = np.concatenate([[0], np.cumsum(tiles)])
+    total = max(int(first_tile[-1]), 1) * tile
+    # Row of each read: its plane's first tile, then its rank in the plane.
+    sorted_plane = voxel[order, axis]
+    rank = np.arange(len(order)) - np.concatenate([[0], np.cumsum(count)])[sorted_plane]
+    row = first_tile[sorted_plane] * tile + rank
+
+    flat = lambda where: where[:, u] * padded[v] + where[:, v]
+
+    def spread(values, fill, dtype):
+        out = np.full((*values.shape[1:], total), fill, dtype)
+        out[..., row] = np.moveaxis(values[order], 0, -1)
+        return jnp.asarray(out)
+
+    return Reads(
+        cell=spread(flat(voxel), 0, np.int32),
+        element=spread(rows["element"], 0, np.int32),
+        plane=spread(np.column_stack([rows["offset"], rows["normal"][:, [axis, u, v]]]), 0.0, real),
+        home=spread(np.column_stack([rows["voxel"][:, axis], flat(rows["voxel"])]), 0, np.int32),
+        first_tile=jnp.asarray(first_tile, np.int32),
+        tile=tile,
+    )
+
+
+class Ordinates(eqx.Module):
+    """The directions swept along one axis, in chunks of equal size; weight 0 pads.
+
+    `slope` is the step (du, dv) a plane, `start` the fractional position (fx, fy) at the first plane, `sign` the sense along
+    the axis, `index` the direction's number in the quadrature.
+    """
+
+    direction: Float[Array, "G D 3"]  # along (axis, u, v)
+    weight: Float[Array, "G D"]
+    slope: Float[Array, "G D 2"]
+    start: Float[Array, "G D 2"]
+    index: Int[Array, "G D"]
+    sign: Int[Array, " G"]
+    laps: Int[Array, " G"]
+    # Bit d of each hit or probe read: rays of direction d arrive at the element in its own voxel.
+    hit_bits: UInt32[Array, "G M"] | None = None
+    probe_bits: UInt32[Array, "G M2"] | None = None
+
+
+def make_ordinates(quadrature: Quadrature, bands: int) -> tuple[Ordinates, Ordinates, Ordinates]:
+    """Sort directions by their dominant axis and sense, and chunk them."""
+    w = quadrature.directions
+    dominant = np.argmax(np.abs(w), axis=1)
+    groups = {
+        (axis, sign): np.nonzero((dominant == axis) & (np.sign(w[:, axis]) == sign))[0]
+        for axis in range(3)
+        for sign in (1, -1)
+    }
+    largest = max(len(g) for g in groups.values())
+    wanted = min(32, max(4, _CHUNK // bands))
+    size = -(-largest // -(-largest // wanted))
+    return tuple(_axis_ordinates(quadrature, axis, groups, size) for axis in range(3))
+
+
+def _axis_ordinates(quadrature: Quadrature, axis: int, groups: dict, size: int) -> Ordinates:
+    order = list(AXES[axis])
+    chunks = [(sign, g[i : i + size]) for sign in (1, -1) for g in [groups[axis, sign]] for i in range(0, len(g), size)]
+    count = len(chunks)
+    direction = np.zeros((count, size, 3))
+    weight, index = np.zeros((count, size)), np.zeros((count, size), int)
+    slope, start = np.zeros((count, size, 2)), np.full((count, size, 2), 0.5)
+    for row, (sign, members) in enumerate(chunks):
+        direction[row, :, 0] = sign
+        n = len(members)
+        direction[row, :n] = quadrature.directions[members][:, order]
+        weight[row, :n], index[row, :n] = quadrature.weights[members], members
+        slope[row, :n] = direction[row, :n, 1:] / np.abs(direction[row, :n, :1])
+        # The first offset goes with the larger slope, and is measured along the ray: turned scenes get turned rays.
+        offset = quadrature.offsets[members]
+        swap = np.abs(slope[row, :n, 1]) > np.abs(slope[row, :n, 0])
+        offset = np.where(swap[:, None], offset[:, ::-1], offset)
+        start[row, :n] = np.where(slope[row, :n] < 0, 1 - offset, offset)
+    real = np.dtype(jnp.zeros(0).dtype)
+    return Ordinates(
+        direction=jnp.asarray(direction, real), weight=jnp.asarray(weight, real), slope=jnp.asarray(slope, real),
+        start=jnp.asarray(start, real), index=jnp.asarray(index, np.int32),
+        sign=jnp.asarray([c[0] for c in chunks], np.int32).reshape(count), laps=jnp.ones(count, np.int32),
+    )  # fmt: skip

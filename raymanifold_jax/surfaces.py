@@ -1,0 +1,323 @@
+"""Where the surfaces are: CUT voxels and the surface elements they hold.
+
+The scene's signed distance f (in voxels here) is sampled once, on the host, in float64. A voxel that the surface crosses
+is CUT and gets one *element* per distinct face in it: the plane n . (x - c) + offset = 0 through the voxel with centre c, with
+the outward unit normal n, its area inside the voxel, and a material. Faces that lie exactly between two voxels belong to
+the voxel on the solid side (offset = -1/2). Every side of the domain that is closed or open holds elements of the same kind
+in a layer of ghost voxels around the lattice: a wall reflects, an open side is black and lets the light of the sky in.
+
+Public: `Surfaces`, `find_surfaces`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .scene import OPEN, Scene, Wall
+
+#: Faces whose normals differ by more than this (as a cosine) become elements of their own.
+_SAME_FACE = 0.7
+#: Points this far behind a face (voxels) decide which voxel owns it: the one on the solid side.
+_INWARD = 1e-3
+_PATCH = 8  # samples a side on an element's plane
+_BATCH = 1 << 15  # voxels analysed at once
+
+
+@dataclasses.dataclass(frozen=True)
+class Surfaces:
+    """Surface elements of a scene, one row each, and the voxels inside solids.
+
+    `voxel` (E, 3) counts from 0; -1 and n are the ghost layers of the domain's sides. `offset` is the signed distance in voxels
+    of the voxel's centre from the element's plane. `material` indexes the solids, then the six sides. `side` is 0..5
+    (x-, x+, y-, y+, z-, z+) for elements of the domain's sides, else -1.
+    """
+
+    voxel: np.ndarray
+    normal: np.ndarray
+    offset: np.ndarray
+    area: np.ndarray  # scene units squared
+    position: np.ndarray  # scene units
+    material: np.ndarray
+    side: np.ndarray
+    open: np.ndarray
+    solid: np.ndarray  # (nx, ny, nz): wholly inside a solid
+
+    def __len__(self) -> int:
+        return len(self.area)
+
+    @property
+    def probe(self) -> np.ndarray:
+        """(E, 3) the voxel that stands in where no ray hits: the element's own if its centre is outside the solid."""
+        axis = np.argmax(np.abs(self.normal), axis=1)
+        step = np.zeros_like(self.voxel)
+        rows = np.arange(len(self))
+        step[rows, axis] = np.sign(self.normal[rows, axis]).astype(int)
+        return self.voxel + np.where(self.offset > 0, 0, 1)[:, None] * step
+
+
+def find_surfaces(scene: Scene) -> Surfaces:
+    """Sample the scene's signed distance and return its surface elements."""
+    with jax.enable_x64(True):
+        field = _DistanceField(scene)
+        lattice = scene.lattice
+        distance = field.distance(lattice.centers().reshape(-1, 3)).reshape(lattice.shape)
+        parts = [_solid_elements(scene, field, distance)] if scene.solids else []
+        cut = np.zeros(lattice.shape, bool)
+        for part in parts:
+            cut[tuple(part["voxel"].T)] = True
+        solid = (distance < 0) & ~cut
+        parts += [p for side in range(6) if (p := _side_elements(scene, field, side)) is not None]
+    if not parts:
+        parts = [_elements()]
+    joined = {key: np.concatenate([p[key] for p in parts]) for key in parts[0]}
+    return Surfaces(**joined, solid=solid)
+
+
+def _elements(
+    voxel=np.zeros((0, 3), int), normal=np.zeros((0, 3)), offset=np.zeros(0), area=np.zeros(0), position=np.zeros((0, 3)),
+    material=np.zeros(0, int), side=-1, open=False,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    count = len(area)
+    return {
+        "voxel": voxel, "normal": normal, "offset": offset, "area": area, "position": position, "material": material,
+        "side": np.full(count, side), "open": np.full(count, open),
+    }  # fmt: skip
+
+
+class _DistanceField:
+    """The scene's signed distance and its gradient in voxels, at points in scene units, in batches."""
+
+    def __init__(self, scene: Scene):
+        self.spacing = scene.lattice.spacing
+        self._scene = scene
+        value = lambda s, x: s.distance(x[None])[0]
+        self._distance = eqx.filter_jit(lambda s, x: s.distance(x))
+        self._gradient = eqx.filter_jit(jax.vmap(jax.value_and_grad(value, argnums=1), in_axes=(None, 0)))
+        self._nearest = eqx.filter_jit(lambda s, x: s.solid_at(x))
+
+    def distance(self, points: np.ndarray) -> np.ndarray:
+        return self._batched(lambda x: self._distance(self._scene, x), points) / self.spacing
+
+    def gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        value, slope = self._batched(lambda x: self._gradient(self._scene, x), points)
+        return value / self.spacing, slope
+
+    def nearest(self, points: np.ndarray) -> np.ndarray:
+        return self._batched(lambda x: self._nearest(self._scene, x), points)
+
+    @staticmethod
+    def _batched(function: Callable, points: np.ndarray, size: int = 1 << 18):
+        shape = points.shape[:-1]
+        flat = points.reshape(-1, 3)
+        # One padded batch size keeps this to one compilation, two where the scene is small.
+        size = min(size, max(1024, 1 << (max(len(flat), 1) - 1).bit_length()))
+        parts = []
+        for start in range(0, max(len(flat), 1), size):
+            block = flat[start : start + size]
+            padded = np.zeros((size, 3)) if len(block) < size else block
+            padded[: len(block)] = block
+            parts.append(jax.tree.map(lambda a, n=len(block): np.asarray(a)[:n], function(jnp.asarray(padded))))
+        return jax.tree.map(lambda *a: np.concatenate(a).reshape(*shape, *a[0].shape[1:]), *parts)
+
+
+def _solid_elements(scene: Scene, field: _DistanceField, distance: np.ndarray) -> dict[str, np.ndarray]:
+    """Elements of the solids' surfaces in the lattice's voxels."""
+    lattice = scene.lattice
+    candidates = np.argwhere(np.abs(distance) < 0.5 * np.sqrt(3) + 0.1)
+    found = [
+        _faces(scene, field, candidates[i : i + _BATCH], distance[tuple(candidates[i : i + _BATCH].T)])
+        for i in range(0, len(candidates), _BATCH)
+    ]
+    if not found:
+        return _elements()
+    joined = {key: np.concatenate([f[key] for f in found]) for key in found[0]}
+    center = lattice.lower + (joined["voxel"] + 0.5) * lattice.spacing
+    position = center + joined.pop("centroid") * lattice.spacing
+    material = field.nearest(position).astype(int)
+    joined["area"] = joined["area"] * lattice.spacing**2
+    return _elements(position=position, material=material, **joined)
+
+
+def _faces(scene: Scene, field: _DistanceField, voxels: np.ndarray, distance: np.ndarray) -> dict[str, np.ndarray]:
+    """The faces in some voxels: one where the surface is smooth, one for each side of a crease."""
+    spacing = scene.lattice.spacing
+    center = scene.lattice.lower + (voxels + 0.5) * spacing
+    normals, has_face = _distinct_normals(field, center, spacing)
+    # Where the surface is smooth the distance at the centre gives the plane itself.
+    own_distance, own_normal = field.gradient(center)
+    smooth = (np.abs(np.linalg.norm(own_normal, axis=1) - 1) < 1e-3) & (has_face.sum(1) <= 1)
+    has_face[smooth, 0] = True
+    normals[smooth, 0] = own_normal[smooth]
+    rows, which = np.nonzero(has_face)
+    normal = normals[rows, which]
+    on_plane = np.where(smooth[rows], own_distance[rows], np.nan)
+    creased = ~smooth[rows]
+    on_plane[creased] = _plane_offset(field, center[rows[creased]], normal[creased], spacing)
+    # Planes through the middle of their patch: the tangent at the point nearest the centre would stand proud of a ball.
+    rounded = ~creased
+    normal[rounded], on_plane[rounded] = _refit(field, center[rows[rounded]], normal[rounded], on_plane[rounded], spacing)
+    patch, inside = _patch_points(normal, on_plane)
+    error = field.distance(center[rows, None] + patch * spacing)
+    real = inside & (np.abs(error) < 0.1)
+    count, whole = real.sum(1), inside.sum(1)
+    area = plane_area_in_voxel(normal, on_plane) * np.where(creased, count / np.maximum(whole, 1), 1.0)
+    half_width = 0.5 * np.abs(normal).sum(1)
+    owned = (on_plane < half_width - 1e-6) & (on_plane >= -half_width - 1e-6)
+    keep = owned & (count > 0.02 * _PATCH**2) & (area > 1e-3) & np.isfinite(on_plane)
+    centroid = (patch * real[..., None]).sum(1) / np.maximum(count, 1)[:, None]
+    return {
+        "voxel": voxels[rows][keep], "normal": normal[keep], "offset": on_plane[keep], "area": area[keep],
+        "centroid": centroid[keep],
+    }  # fmt: skip
+
+
+def _refit(field: _DistanceField, center, normal, offset, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Move planes so that over their patches in the voxel the signed distance averages 0 and its slope is theirs."""
+    patch, inside = _patch_points(normal, offset)
+    value, slope = field.gradient(center[:, None] + patch * spacing)
+    count = np.maximum(inside.sum(1), 1)
+    mean_value = (value * inside).sum(1) / count
+    mean_slope = (slope * inside[..., None]).sum(1) / count[:, None]
+    length = np.linalg.norm(mean_slope, axis=1)
+    middle = (patch * inside[..., None]).sum(1) / count[:, None]
+    usable = inside.any(1) & (length > 0.9) & (np.abs(mean_value) < 0.3)
+    refitted = mean_slope / np.maximum(length, 1e-12)[:, None]
+    through = mean_value - np.einsum("mi,mi->m", refitted, middle)
+    return np.where(usable[:, None], refitted, normal), np.where(usable, through, offset)
+
+
+def _distinct_normals(field: _DistanceField, center: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """Up to three distinct surface normals in each voxel: (M, 3, 3) and which of them exist (M, 3)."""
+    side = (np.arange(4) + 0.5) / 4 - 0.5
+    samples = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
+    points = center[:, None] + samples * spacing
+    for _ in range(2):  # project the samples on the surface
+        value, slope = field.gradient(points)
+        points = points - (value * spacing)[..., None] * slope
+    value, _ = field.gradient(points)
+    _, slope = field.gradient(points + 1e-4 * spacing * slope)
+    behind = (points - center[:, None]) / spacing - _INWARD * slope
+    valid = (np.abs(behind).max(-1) <= 0.5) & (np.abs(value) < 0.02)
+    valid &= np.abs(np.linalg.norm(slope, axis=-1) - 1) < 1e-3
+    normals = np.zeros((len(center), 3, 3))
+    exists = np.zeros((len(center), 3), bool)
+    rows = np.arange(len(center))
+    for face in range(3):
+        seed = np.argmax(valid, axis=1)
+        exists[:, face] = valid[rows, seed]
+        same = valid & (np.einsum("msi,mi->ms", slope, slope[rows, seed]) > _SAME_FACE)
+        mean = (slope * same[..., None]).sum(1)
+        normals[:, face] = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
+        valid &= ~same
+    return normals, exists
+
+
+def _plane_offset(field: _DistanceField, center: np.ndarray, normal: np.ndarray, spacing: float) -> np.ndarray:
+    """Signed distance of a voxel's centre from the face with this normal: march along the normal to the surface.
+
+    NaN where that face is not met within the voxel's reach.
+    """
+    if not len(center):
+        return np.zeros(0)
+    steps = np.linspace(-0.9, 0.9, 37)
+    # Sampling f on the normal's line through several points of the voxel finds the face even off-centre.
+    side = np.array([-0.375, -0.125, 0.125, 0.375])
+    starts = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
+    starts = starts - np.einsum("si,mi->ms", starts, normal)[..., None] * normal[:, None]
+    points = center[:, None, None] + (starts[:, :, None] + steps[:, None] * normal[:, None, None]) * spacing
+    value, slope = field.gradient(points.reshape(len(center), -1, 3))
+    aligned = np.einsum("msi,mi->ms", slope, normal) > 0.999
+    height = np.broadcast_to(steps, (len(center), starts.shape[1], len(steps))).reshape(len(center), -1)
+    estimate = np.where(aligned & (np.abs(value) < 0.2), height - value, np.nan)
+    with np.errstate(all="ignore"):
+        return -np.nanmedian(estimate, axis=1)
+
+
+def _patch_points(normal: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points on each plane, on a grid along its dominant axis: (M, n*n, 3) from the centre, and which lie in the voxel."""
+    axis = np.argmax(np.abs(normal), axis=1)
+    rows = np.arange(len(normal))
+    grid = (np.arange(_PATCH) + 0.5) / _PATCH - 0.5
+    a, b = (g.ravel() for g in np.meshgrid(grid, grid, indexing="ij"))
+    points = np.zeros((len(normal), _PATCH**2, 3))
+    u, v = (axis + 1) % 3, (axis + 2) % 3
+    points[rows, :, u] = a
+    points[rows, :, v] = b
+    slope = np.where(normal[rows, axis] >= 0, 1, -1) * np.maximum(np.abs(normal[rows, axis]), 1e-6)
+    height = -(offset[:, None] + normal[rows, u, None] * a + normal[rows, v, None] * b) / slope[:, None]
+    points[rows, :, axis] = height
+    return np.nan_to_num(points, nan=9.0), np.abs(np.nan_to_num(height, nan=9.0)) <= 0.5 + 1e-6
+
+
+def plane_area_in_voxel(normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """Area of the plane n . x + offset = 0 inside the unit cube around the origin: (M, 3), (M,) -> (M,).
+
+    The second derivative of the cube's corner-sum formula for the volume below a plane; exact for any orientation.
+    """
+    n = np.sort(np.abs(normal), axis=1)[:, ::-1]
+    n = np.maximum(n / np.linalg.norm(n, axis=1, keepdims=True), [[0.0, 1e-5, 1e-5]])
+    # Distance past the first corner (the area is symmetric in the offset's sign); a plane that is a face counts in full.
+    depth = np.maximum(0.5 * n.sum(1) - np.abs(offset), 2e-4)
+    total = np.zeros(len(n))
+    for corner in np.ndindex(2, 2, 2):
+        sign = (-1) ** sum(corner)
+        total += sign * np.maximum(depth - n @ np.array(corner, float), 0.0) ** 2
+    return np.maximum(total / (2 * n.prod(1)), 0.0)
+
+
+def _side_elements(scene: Scene, field: _DistanceField, side: int) -> dict[str, np.ndarray] | None:
+    """Elements of one side of the domain: the faces of its boundary voxels that no solid covers."""
+    kind = scene.boundary.sides[side]
+    if not (kind is OPEN or isinstance(kind, Wall)):
+        return None
+    lattice = scene.lattice
+    axis, upper = side // 2, side % 2
+    u, v = (axis + 1) % 3, (axis + 2) % 3
+    inward = np.zeros(3)
+    inward[axis] = -1.0 if upper else 1.0
+    i, j = (g.ravel() for g in np.meshgrid(np.arange(lattice.shape[u]), np.arange(lattice.shape[v]), indexing="ij"))
+    voxel = np.zeros((len(i), 3), int)
+    voxel[:, axis] = lattice.shape[axis] if upper else -1
+    voxel[:, u], voxel[:, v] = i, j
+    grid = (np.arange(4) + 0.5) / 4 - 0.5
+    offsets = np.zeros((16, 3))
+    offsets[:, u], offsets[:, v] = (g.ravel() for g in np.meshgrid(grid, grid, indexing="ij"))
+    face = voxel + 0.5 + 0.5 * inward
+    points = face[:, None] + offsets
+    at = lambda depth: lattice.lower + (points + depth * inward) * lattice.spacing
+    if scene.solids:
+        exposed = field.distance(at(0.01)) > 0
+        # A solid that lies just behind the side shows through it, flush: a lamp in a ceiling.
+        flush = exposed & (field.distance(at(-0.01)) < 0)
+    else:
+        exposed, flush = np.ones(points.shape[:2], bool), np.zeros(points.shape[:2], bool)
+    parts = []
+    for member, material, is_open in (
+        (exposed & ~flush, len(scene.solids) + side, kind is OPEN),
+        (flush, None, False),
+    ):
+        fraction = member.mean(1)
+        keep = fraction > 0
+        if not keep.any():
+            continue
+        centroid = (points[keep] * member[keep][..., None]).sum(1) / member[keep].sum(1)[:, None]
+        position = lattice.lower + centroid * lattice.spacing
+        if material is None:
+            index = field.nearest(position - 0.01 * inward * lattice.spacing).astype(int)
+        else:
+            index = np.full(keep.sum(), material)
+        parts.append(
+            _elements(
+                voxel=voxel[keep], normal=np.tile(inward, (keep.sum(), 1)), offset=np.full(keep.sum(), -0.5),
+                area=fraction[keep] * lattice.spacing**2, position=position, material=index, side=side, open=is_open,
+            )
+        )  # fmt: skip
+    if not parts:
+        return None
+    return {key: np.concatenate([p[key] for p in parts]) for key in parts[0]}

@@ -1,0 +1,1 @@
+"""Transport schemes: how radiance moves from plane to plane."""

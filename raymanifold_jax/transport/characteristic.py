@@ -1,0 +1,402 @@
+"""The characteristic scheme: one plane at a time, exact in the cell.
+
+Rays of one direction w cross the planes of the lattice along the axis where |w| is largest. From one plane to the next a ray
+moves by the slopes (p, q) = (w_u, w_v) / |w_axis|, at most one voxel each, so it crosses at most one boundary along u and one
+along v: three segments, whose lengths and end points are the same for all rays of the direction ("the same step
+everywhere", Langer, Breton & Zucker 1995, section 4). Over the free part of a segment, of optical length tau,
+
+    L' = S + (L - S) exp(-tau),    mean = S + (L - S) (1 - exp(-tau)) / tau,
+
+with S the source function. A surface is the plane g(e) = offset + n . e = 0 in its voxel, e from the voxel's centre: where g
+changes from + to - along a segment the ray arrives at the surface and leaves as the surface's exitant radiance; where it
+changes from - to +, the free part begins at the surface.
+
+Public: `Characteristic`, `sweep`, `SweptMedium`, `Inflow`, `mark_hits`, `count_laps`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float, Int, UInt32
+
+from ..layout import AXES, AxisReads, Layout, Ordinates, Reads
+from ..shift import shift
+
+#: A ray counts as arriving at an element if it is at most this far (voxels) behind its plane where it enters the voxel: the
+#: planes of neighbouring voxels on a curved surface do not join exactly.
+_BEHIND = 0.05
+_THIN = 0.05  # below this optical length, (1 - exp(-tau)) / tau by its series
+
+
+class Characteristic(eqx.Module):
+    """The default scheme: exact chords, CUT voxels, any direction (see the module's docstring)."""
+
+
+class SweptMedium(eqx.Module):
+    """A medium on the padded lattice."""
+
+    extinction: Float[Array, "C X Y Z"]  # 1 / scene unit
+    source: Float[Array, "C X Y Z"]  # source function, W m^-2 sr^-1
+
+
+class Inflow(eqx.Module):
+    """Radiance entering open sides: by mirror image of the side and direction of the quadrature."""
+
+    radiance: Float[Array, "images n C"]
+
+
+class Chords(NamedTuple):
+    """The three segments of each direction's rays between two planes; [D] each, points relative to the voxel's centre."""
+
+    ends: tuple  # ((e_axis, e_u, e_v) entry, the same exit) of each segment
+    share: tuple  # each segment's share of the step
+    offsets: tuple  # flat moves after the first and the second segment
+
+
+def sweep(
+    layout: Layout,
+    ordinates: tuple[Ordinates, Ordinates, Ordinates],
+    exitance: Float[Array, "C E"],
+    medium: SweptMedium | None = None,
+    inflow: Inflow | None = None,
+    fluence: bool = True,
+) -> tuple[Float[Array, "C E"], Float[Array, "C nx ny nz"] | None]:
+    """One coordinate evolution over all six faces: the light that `exitance`, the medium's source and `inflow` send out.
+
+    Returns the sums, over directions, of weight * cosine * radiance arriving at each element, and of weight * path share *
+    radiance in each voxel (None without `fluence`). Divide by the same sums for a uniform radiance of 1 (the *furnace*) to
+    get means: a furnace is then exact by construction.
+    """
+    bands = exitance.shape[0]
+    surface = layout.exitance_field(exitance)
+    at_elements = jnp.zeros((bands, layout.elements), exitance.dtype)
+    in_voxels = jnp.zeros((bands, *layout.padded), exitance.dtype) if fluence else None
+    for axis, (axes, own, reads) in enumerate(zip(AXES, ordinates, layout.reads, strict=True)):
+        if own.weight.shape[0] == 0:
+            continue
+        hits, probes, passing = _sweep_axis(layout, axis, own, reads, surface, medium, inflow, fluence)
+        at_elements = at_elements.at[:, reads.hits.element].add(hits).at[:, reads.probes.element].add(probes)
+        if in_voxels is not None and passing is not None:
+            shape = tuple(layout.padded[a] for a in axes)
+            back = tuple(axes.index(a) for a in range(3))
+            field = jnp.moveaxis(passing, 1, 0).reshape(bands, *shape)
+            in_voxels = in_voxels + field.transpose(0, *(1 + b for b in back))
+    return at_elements, None if in_voxels is None else layout.from_padded(in_voxels)
+
+
+def _planes(field: Float[Array, "*C X Y Z"], axis: int) -> Float[Array, "K *C P"]:
+    """A field as flat planes along a sweep axis."""
+    bands = field.ndim - 3
+    turned = field.transpose(bands + axis, *range(bands), *(bands + a for a in AXES[axis][1:]))
+    return turned.reshape(*turned.shape[:-2], -1)
+
+
+def _sweep_axis(
+    layout: Layout,
+    axis: int,
+    ordinates: Ordinates,
+    reads: AxisReads,
+    surface: Float[Array, "C X Y Z"],
+    medium: SweptMedium | None,
+    inflow: Inflow | None,
+    fluence: bool,
+) -> tuple[Float[Array, "C M"], Float[Array, "C M2"], Float[Array, "K C P"] | None]:
+    bands, real = surface.shape[0], surface.dtype
+    order = AXES[axis]
+    components = [layout.plane[row].astype(real) for row in (0, *(1 + a for a in order))]
+    fields = _Fields(
+        geometry=tuple(_planes(c, axis) for c in components),
+        exitance=_planes(surface, axis),
+        extinction=None if medium is None else _planes(medium.extinction, axis),
+        source=None if medium is None else _planes(medium.source, axis),
+    )
+    count, area = fields.geometry[0].shape
+    width = layout.padded[order[2]]
+    wrap_u, wrap_v = layout.pad[order[1]] == 0, layout.pad[order[2]] == 0
+    images = _planes(layout.inflow_image, axis) if inflow is not None else None
+    periodic = layout.pad[axis] == 0
+
+    def chunk_step(chunk, totals):
+        own = jax.tree.map(lambda a: a[chunk], ordinates)
+        length = layout.spacing / jnp.abs(own.direction[:, 0])
+        radiance_in = None if inflow is None else inflow.radiance[:, own.index]
+
+        def plane_step(step, table, rays, totals, keep):
+            plane_number = jnp.where(own.sign > 0, step, count - 1 - step)
+            chords = table.at(step)
+            plane = fields.at(plane_number)
+            entering = None if images is None else _entering(images[plane_number], radiance_in)
+            starts, rays, passing = _cross(rays, chords, plane, length, entering, width, wrap_v, fluence and keep)
+            if not keep:
+                return rays, totals
+            hits, probes, mean = totals
+            if passing is not None:
+                row = lax.dynamic_index_in_dim(mean, plane_number, 0, keepdims=False)
+                row = row + jnp.tensordot(own.weight, passing, 1)
+                mean = lax.dynamic_update_index_in_dim(mean, row, plane_number, 0)
+            here = (own, starts, chords, plane, length)
+            hits = _read(hits, plane_number, reads.hits, own.hit_bits, *here, _mean_of_hits)
+            probes = _read(probes, plane_number, reads.probes, ~own.probe_bits, *here, _mean_of_paths)
+            return rays, (hits, probes, mean)
+
+        rays = jnp.zeros((own.weight.shape[0], bands, area), real)
+        if periodic:  # enough laps around the torus that what entered at the first no longer matters
+
+            def lap(number, rays):
+                table = _chord_table(own, (number - own.laps + 1) * count, count, width, wrap_v)
+                return lax.fori_loop(0, count, lambda k, r: plane_step(k, table, r, None, False)[0], rays)
+
+            rays = lax.fori_loop(0, own.laps - 1, lap, rays)
+        table = _chord_table(own, 0, count, width, wrap_v)
+        rays, totals = lax.fori_loop(0, count, lambda k, c: plane_step(k, table, *c, True), (rays, totals))
+        return totals
+
+    totals = (
+        jnp.zeros((bands, reads.hits.cell.shape[0]), real),
+        jnp.zeros((bands, reads.probes.cell.shape[0]), real),
+        jnp.zeros((count, bands, area), real) if fluence else None,
+    )
+    return lax.fori_loop(0, ordinates.weight.shape[0], chunk_step, totals)
+
+
+class _ChordTable(NamedTuple):
+    """The chords of a chunk for all planes of a sweep: worked out once, because XLA would do it again for every voxel."""
+
+    reals: Float[Array, "K 21 D"]
+    offsets: Int[Array, "K 2 D"]
+
+    def at(self, step: Int[Array, ""]) -> Chords:
+        reals = lax.dynamic_index_in_dim(self.reals, step, 0, keepdims=False)
+        offsets = lax.dynamic_index_in_dim(self.offsets, step, 0, keepdims=False)
+        points = [tuple(reals[3 * i + j] for j in range(3)) for i in range(6)]
+        return Chords(tuple(zip(points[::2], points[1::2], strict=True)), tuple(reals[18:]), tuple(offsets))
+
+
+def _chord_table(own: Ordinates, first: Int[Array, ""] | int, count: int, width: int, wrap_v: bool) -> _ChordTable:
+    def one(step):
+        chords = _chords(own, step, width, wrap_v)
+        points = [x for ends in chords.ends for point in ends for x in point]
+        return jnp.stack([*points, *chords.share]), jnp.stack(chords.offsets)
+
+    return _ChordTable(*jax.vmap(one)(first + jnp.arange(count)))
+
+
+class _Fields(NamedTuple):
+    """Geometry (offset and normal), exitance, extinction and source of some planes, of one plane, or of voxels of one.
+
+    Each is an array of its own: slices of one stacked array keep XLA from vectorising the step (20 times slower).
+    """
+
+    geometry: tuple[Array, ...]
+    exitance: Array
+    extinction: Array | None
+    source: Array | None
+
+    def at(self, plane: Int[Array, ""]) -> _Fields:
+        return jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, plane, 0, keepdims=False), self)
+
+    def cells(self, cells: Int[Array, " T"]) -> _Fields:
+        return jax.tree.map(lambda a: a[..., cells], self)
+
+
+def _chords(own: Ordinates, step: Int[Array, ""], width: int, wrap_v: bool) -> Chords:
+    """Where each direction's rays cross voxel boundaries between plane `step` and the next, counted from their start."""
+
+    def crossing(k):
+        slope, here = own.slope[:, k], own.start[:, k] + step * own.slope[:, k]
+        there = own.start[:, k] + (step + 1) * own.slope[:, k]
+        moved = jnp.floor(there) - jnp.floor(here)
+        place = here - jnp.floor(here)
+        gap = jnp.where(moved > 0, 1 - place, place)
+        when = jnp.where(moved == 0, 1.0, gap / jnp.maximum(jnp.abs(slope), 1e-30))
+        return place - 0.5, slope, moved, jnp.clip(when, 0.0, 1.0)
+
+    u, p, move_u, when_u = crossing(0)
+    v, q, move_v, when_v = crossing(1)
+    u_first = when_u <= when_v
+    first, second = jnp.minimum(when_u, when_v), jnp.maximum(when_u, when_v)
+    flat_u = (move_u * width).astype(jnp.int32)
+    flat_v = jnp.zeros_like(flat_u) if wrap_v and width == 1 else move_v.astype(jnp.int32)
+    sense = own.sign.astype(u.dtype)
+
+    def point(time, crossed_u, crossed_v):
+        e_u = u + p * time - jnp.where(crossed_u, move_u, 0.0)
+        e_v = v + q * time - jnp.where(crossed_v, move_v, 0.0)
+        return sense * (time - 0.5), jnp.clip(e_u, -0.5, 0.5), jnp.clip(e_v, -0.5, 0.5)
+
+    zero, one = jnp.zeros_like(u), jnp.ones_like(u)
+    never, always = jnp.zeros_like(u_first), jnp.ones_like(u_first)
+    ends = (
+        (point(zero, never, never), point(first, never, never)),
+        (point(first, u_first, ~u_first), point(second, u_first, ~u_first)),
+        (point(second, always, always), point(one, always, always)),
+    )
+    offsets = (jnp.where(u_first, flat_u, flat_v), jnp.where(u_first, flat_v, flat_u))
+    return Chords(ends, (first, second - first, 1 - second), offsets)
+
+
+def _height(geometry: tuple, point: tuple) -> Float[Array, "D 1 P"]:
+    """g = offset + n . e, the height above each voxel's surface plane, of each direction's point."""
+    a, u, v = (x[:, None, None] for x in point)
+    return geometry[0] + geometry[1] * a + geometry[2] * u + geometry[3] * v
+
+
+class _Free(NamedTuple):
+    """The free part of a segment: whether it ends on or starts from a surface, and its share of the segment."""
+
+    arrives: Array
+    departs: Array
+    part: Array
+
+
+def _free_part(geometry: tuple, ends: tuple) -> _Free:
+    g0, g1 = _height(geometry, ends[0]), _height(geometry, ends[1])
+    hit = jnp.minimum(g0, g1) < 0
+    falling = g0 > g1
+    part = jnp.clip(jnp.maximum(g0, g1) / jnp.maximum(jnp.abs(g1 - g0), 1e-9), 0.0, 1.0)
+    return _Free(hit & falling, hit & ~falling, jnp.where(hit, part, 1.0))
+
+
+def _attenuate(radiance, plane: _Fields, length):
+    """Radiance at the end of a path and its mean over it, in the medium."""
+    if plane.extinction is None or plane.source is None:
+        return radiance, radiance
+    tau = plane.extinction * length
+    transmittance = jnp.exp(-tau)
+    series = 1 - tau * (0.5 - tau * (1 / 6 - tau * (1 / 24)))
+    mean = jnp.where(tau < _THIN, series, (1 - transmittance) / jnp.maximum(tau, _THIN))
+    excess = radiance - plane.source
+    return plane.source + transmittance * excess, plane.source + mean * excess
+
+
+def _cross(rays, chords: Chords, plane: _Fields, length, entering, width: int, wrap_v: bool, fluence: bool):
+    """Carry rays [D, C, P] through one plane of voxels; also their radiance before each segment and their path means."""
+    starts, passing = [], None
+    emitted = plane.exitance if entering is None else plane.exitance + entering
+    for number in range(3):
+        if number:
+            # The barrier keeps XLA from computing the segment again for each reader of the moved rays.
+            rays = lax.optimization_barrier(shift(rays, chords.offsets[number - 1], width, wrap_v))
+        starts.append(rays)
+        share = chords.share[number][:, None, None]
+        free = _free_part(plane.geometry, chords.ends[number])
+        begin = jnp.where(free.departs, emitted, rays)
+        end, mean = _attenuate(begin, plane, length[:, None, None] * share * free.part)
+        rays = jnp.where(free.arrives, emitted, end)
+        if fluence:
+            inside = mean * (free.part * share)
+            passing = inside if passing is None else passing + inside
+    return starts, rays, passing
+
+
+def _entering(image: Int[Array, " P"], radiance: Float[Array, "images D C"]) -> Float[Array, "D C P"]:
+    """Sky radiance emitted by the open ghost voxels of a plane."""
+    total = jnp.zeros((*radiance.shape[1:], image.shape[0]), radiance.dtype)
+    for number in range(radiance.shape[0]):
+        total = total + jnp.where(image == number, radiance[number][..., None], 0.0)
+    return total
+
+
+def _read(sums, plane_number, reads: Reads, bits, own: Ordinates, starts, chords: Chords, plane: _Fields, length, mean_of):
+    """Add weight * cosine * radiance for the elements that read voxels of this plane, in the directions of `bits`."""
+    tile = reads.tile
+    number_of_bit = jnp.arange(own.weight.shape[0], dtype=jnp.uint32)[:, None]
+
+    def one(number, sums):
+        start = number * tile
+        cut = lambda a: lax.dynamic_slice_in_dim(a, start, tile, axis=-1)
+        cell, face = cut(reads.cell), cut(reads.plane)
+        radiance = [ray[:, :, cell] for ray in starts]
+        value = mean_of(radiance, plane.cells(cell), face, chords, length[:, None, None])
+        chosen = ((cut(bits) >> number_of_bit) & 1).astype(value.dtype)
+        weight = own.weight[:, None] * jnp.maximum(-(own.direction @ face[1:]), 0.0) * chosen
+        total = jnp.sum(weight[:, None] * value, axis=0)
+        return lax.dynamic_update_slice_in_dim(sums, cut(sums) + total, start, axis=-1)
+
+    return lax.fori_loop(reads.first_tile[plane_number], reads.first_tile[plane_number + 1], one, sums)
+
+
+def _mean_of_hits(radiance, plane: _Fields, face, chords: Chords, length) -> Float[Array, "D C T"]:
+    """Mean radiance of the rays that arrive at the element in its own voxel; 0 where none does."""
+    total = count = 0.0
+    for number, ends in enumerate(chords.ends):
+        share = chords.share[number][:, None, None]
+        hit, part = _hit(face, ends, share)
+        end, _ = _attenuate(radiance[number], plane, length * share * part)
+        total, count = total + jnp.where(hit, end, 0.0), count + hit
+    return total / jnp.maximum(count, 1)
+
+
+def _mean_of_paths(radiance, plane: _Fields, face, chords: Chords, length) -> Float[Array, "D C T"]:
+    """Mean radiance of the free paths in the voxel; 0 where there are none."""
+    total = paths = 0.0
+    for number, ends in enumerate(chords.ends):
+        share = chords.share[number][:, None, None]
+        free = _free_part(plane.geometry, ends)
+        begin = jnp.where(free.departs, plane.exitance, radiance[number])
+        _, mean = _attenuate(begin, plane, length * share * free.part)
+        path = share * free.part
+        total, paths = total + path * mean, paths + path
+    return jnp.where(paths > 1e-6, total / jnp.maximum(paths, 1e-6), 0.0)
+
+
+def _hit(face: Float[Array, "4 T"] | tuple, ends: tuple, share) -> tuple[Array, Array]:
+    """Whether rays arrive at the element's plane in a segment, and the share of the segment before it."""
+    g0, g1 = _height(face, ends[0]), _height(face, ends[1])
+    hit = (g0 >= -_BEHIND) & (g1 < 0) & (share > 0) & (g0 > g1)
+    return hit, jnp.clip(g0 / jnp.maximum(g0 - g1, 1e-9), 0.0, 1.0)
+
+
+def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinates, ...]:
+    """Note which directions have rays that arrive at each element in its own voxel: elsewhere its probe is used.
+
+    Rays that come out of a neighbouring voxel below that voxel's plane do not count. They were stopped there, where the
+    neighbour's plane stands proud of a curved surface, and would darken the element.
+    """
+
+    def one_axis(axis: int, own: Ordinates, reads: AxisReads) -> Ordinates:
+        if own.weight.shape[0] == 0:
+            hits, probes = (jnp.zeros((0, r.cell.shape[0]), jnp.uint32) for r in reads)
+        else:
+            hits, probes = (lax.map(lambda chunk, r=r: _hit_bits(layout, axis, chunk, r), own) for r in reads)
+        empty = lambda x: x is None
+        return eqx.tree_at(lambda o: (o.hit_bits, o.probe_bits), own, (hits, probes), is_leaf=empty)
+
+    return tuple(one_axis(a, o, r) for a, (o, r) in enumerate(zip(ordinates, layout.reads, strict=True)))
+
+
+def _hit_bits(layout: Layout, axis: int, chunk: Ordinates, reads: Reads) -> UInt32[Array, " M"]:
+    order = AXES[axis]
+    count, height, width = (layout.padded[a] for a in order)
+    wrap_v = layout.pad[order[2]] == 0
+    # Ghost voxels emit at their faces, so what leaves them is never inside a solid.
+    open_air = jnp.where(layout.buried, -1.0, jnp.where(layout.plane[0] <= -1.0, 1.0, layout.plane[0]))
+    normals = [_planes(layout.plane[1 + a], axis) for a in order]
+    geometry = [_planes(open_air, axis), *normals]
+
+    def one(face, home):
+        plane, cell = home
+        chords = _chords(chunk, jnp.where(chunk.sign > 0, plane, count - 1 - plane), width, wrap_v)
+        found, clean = False, True
+        for number, ends in enumerate(chords.ends):
+            hit = _hit(face[:, None], ends, chords.share[number][:, None, None])[0][:, 0, 0]
+            offset = jnp.zeros_like(chords.offsets[0]) if number == 0 else chords.offsets[number - 1]
+            along_v = jnp.where((jnp.abs(offset) == 1) & (width > 1), offset, 0)
+            along_u = (offset - along_v) // width
+            before = ((cell // width - along_u) % height) * width + (cell % width - along_v) % width
+            step = chunk.sign if number == 0 else 0
+            inside = [g[(plane - step) % count, before] for g in geometry]
+            # The same point seen from the voxel before: one voxel further along the axis that is crossed.
+            back = (jnp.full_like(ends[0][0], step), along_u.astype(face.dtype), along_v.astype(face.dtype))
+            e = [x + y for x, y in zip(ends[0], back, strict=True)]
+            above = inside[0] + inside[1] * e[0] + inside[2] * e[1] + inside[3] * e[2]
+            found, clean = found | hit, clean & (~hit | (above > -1e-3))
+        flags = (found & clean).astype(jnp.uint32)
+        return jnp.sum(flags << jnp.arange(flags.shape[0], dtype=jnp.uint32), dtype=jnp.uint32)
+
+    return jax.vmap(one, in_axes=(1, 1))(reads.plane, reads.home)
