@@ -6,7 +6,7 @@ the outward unit normal n, its area inside the voxel, and a material. Faces that
 the voxel on the solid side (offset = -1/2). Every side of the domain that is closed or open holds elements of the same kind
 in a layer of ghost voxels around the lattice: a wall reflects, an open side is black and lets the light of the sky in.
 
-Public: `Surfaces`, `find_surfaces`.
+Public: `Surfaces`, `find_surfaces`, `patch_points`.
 """
 
 from __future__ import annotations
@@ -66,7 +66,8 @@ def find_surfaces(scene: Scene) -> Surfaces:
     with jax.enable_x64(True):
         field = _DistanceField(scene)
         lattice = scene.lattice
-        distance = field.distance(lattice.centers().reshape(-1, 3)).reshape(lattice.shape)
+        far = np.full(lattice.shape, np.inf)
+        distance = field.distance(lattice.centers()) if scene.solids else far
         parts = [_solid_elements(scene, field, distance)] if scene.solids else []
         cut = np.zeros(lattice.shape, bool)
         for part in parts:
@@ -91,25 +92,30 @@ def _elements(
 
 
 class _DistanceField:
-    """The scene's signed distance and its gradient in voxels, at points in scene units, in batches."""
+    """The solids' signed distance and its gradient in voxels, at points in scene units, in batches."""
 
     def __init__(self, scene: Scene):
         self.spacing = scene.lattice.spacing
-        self._scene = scene
-        value = lambda s, x: s.distance(x[None])[0]
-        self._distance = eqx.filter_jit(lambda s, x: s.distance(x))
+        # The shapes alone: albedos may be traced while a scene is being fitted, its geometry never is.
+        self._shapes = tuple(solid.shape for solid in scene.solids)
+
+        def distances(shapes, x):
+            return jnp.stack([s.distance(x) for s in shapes])
+
+        value = lambda shapes, x: distances(shapes, x[None]).min()
+        self._distance = eqx.filter_jit(lambda s, x: distances(s, x).min(0))
         self._gradient = eqx.filter_jit(jax.vmap(jax.value_and_grad(value, argnums=1), in_axes=(None, 0)))
-        self._nearest = eqx.filter_jit(lambda s, x: s.solid_at(x))
+        self._nearest = eqx.filter_jit(lambda s, x: jnp.argmin(distances(s, x), 0))
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        return self._batched(lambda x: self._distance(self._scene, x), points) / self.spacing
+        return self._batched(lambda x: self._distance(self._shapes, x), points) / self.spacing
 
     def gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        value, slope = self._batched(lambda x: self._gradient(self._scene, x), points)
+        value, slope = self._batched(lambda x: self._gradient(self._shapes, x), points)
         return value / self.spacing, slope
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
-        return self._batched(lambda x: self._nearest(self._scene, x), points)
+        return self._batched(lambda x: self._nearest(self._shapes, x), points)
 
     @staticmethod
     def _batched(function: Callable, points: np.ndarray, size: int = 1 << 18):
@@ -162,7 +168,7 @@ def _faces(scene: Scene, field: _DistanceField, voxels: np.ndarray, distance: np
     # Planes through the middle of their patch: the tangent at the point nearest the centre would stand proud of a ball.
     rounded = ~creased
     normal[rounded], on_plane[rounded] = _refit(field, center[rows[rounded]], normal[rounded], on_plane[rounded], spacing)
-    patch, inside = _patch_points(normal, on_plane)
+    patch, inside = patch_points(normal, on_plane)
     error = field.distance(center[rows, None] + patch * spacing)
     real = inside & (np.abs(error) < 0.1)
     count, whole = real.sum(1), inside.sum(1)
@@ -179,7 +185,7 @@ def _faces(scene: Scene, field: _DistanceField, voxels: np.ndarray, distance: np
 
 def _refit(field: _DistanceField, center, normal, offset, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Move planes so that over their patches in the voxel the signed distance averages 0 and its slope is theirs."""
-    patch, inside = _patch_points(normal, offset)
+    patch, inside = patch_points(normal, offset)
     value, slope = field.gradient(center[:, None] + patch * spacing)
     count = np.maximum(inside.sum(1), 1)
     mean_value = (value * inside).sum(1) / count
@@ -239,13 +245,13 @@ def _plane_offset(field: _DistanceField, center: np.ndarray, normal: np.ndarray,
         return -np.nanmedian(estimate, axis=1)
 
 
-def _patch_points(normal: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def patch_points(normal: np.ndarray, offset: np.ndarray, count: int = _PATCH) -> tuple[np.ndarray, np.ndarray]:
     """Points on each plane, on a grid along its dominant axis: (M, n*n, 3) from the centre, and which lie in the voxel."""
     axis = np.argmax(np.abs(normal), axis=1)
     rows = np.arange(len(normal))
-    grid = (np.arange(_PATCH) + 0.5) / _PATCH - 0.5
+    grid = (np.arange(count) + 0.5) / count - 0.5
     a, b = (g.ravel() for g in np.meshgrid(grid, grid, indexing="ij"))
-    points = np.zeros((len(normal), _PATCH**2, 3))
+    points = np.zeros((len(normal), count**2, 3))
     u, v = (axis + 1) % 3, (axis + 2) % 3
     points[rows, :, u] = a
     points[rows, :, v] = b

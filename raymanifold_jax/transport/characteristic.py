@@ -96,6 +96,48 @@ def _planes(field: Float[Array, "*C X Y Z"], axis: int) -> Float[Array, "K *C P"
     return turned.reshape(*turned.shape[:-2], -1)
 
 
+class _Track(NamedTuple):
+    """Everything the sweeps along one axis share."""
+
+    fields: _Fields
+    count: int  # planes
+    area: int  # voxels a plane
+    width: int
+    wrap_v: bool
+    spacing: float
+
+    def length(self, own: Ordinates) -> Float[Array, " D"]:
+        return self.spacing / jnp.abs(own.direction[:, 0])
+
+    def plane(self, own: Ordinates, step: Int[Array, ""]) -> Int[Array, ""]:
+        return jnp.where(own.sign > 0, step, self.count - 1 - step)
+
+    def table(self, own: Ordinates, first: Int[Array, ""] | int) -> _ChordTable:
+        return _chord_table(own, first, self.count, self.width, self.wrap_v)
+
+    def lap(self, own: Ordinates, first: Int[Array, ""] | int, rays: Float[Array, "D C P"]) -> Float[Array, "D C P"]:
+        """Carry rays once around a periodic axis."""
+        table = self.table(own, first)
+
+        def step(k, rays):
+            fields = self.fields.at(self.plane(own, k))
+            return _cross(rays, table.at(k), fields, self.length(own), None, self.width, self.wrap_v, False)[1]
+
+        return lax.fori_loop(0, self.count, step, rays)
+
+
+def _track(layout: Layout, axis: int, surface: Float[Array, "C X Y Z"], medium: SweptMedium | None) -> _Track:
+    order = AXES[axis]
+    fields = _Fields(
+        geometry=tuple(_planes(layout.plane[row], axis) for row in (0, *(1 + a for a in order))),
+        exitance=_planes(surface, axis),
+        extinction=None if medium is None else _planes(medium.extinction, axis),
+        source=None if medium is None else _planes(medium.source, axis),
+    )
+    count, height, width = (layout.padded[a] for a in order)
+    return _Track(fields, count, height * width, width, layout.pad[order[2]] == 0, layout.spacing)
+
+
 def _sweep_axis(
     layout: Layout,
     axis: int,
@@ -107,61 +149,70 @@ def _sweep_axis(
     fluence: bool,
 ) -> tuple[Float[Array, "C M"], Float[Array, "C M2"], Float[Array, "K C P"] | None]:
     bands, real = surface.shape[0], surface.dtype
-    order = AXES[axis]
-    components = [layout.plane[row].astype(real) for row in (0, *(1 + a for a in order))]
-    fields = _Fields(
-        geometry=tuple(_planes(c, axis) for c in components),
-        exitance=_planes(surface, axis),
-        extinction=None if medium is None else _planes(medium.extinction, axis),
-        source=None if medium is None else _planes(medium.source, axis),
-    )
-    count, area = fields.geometry[0].shape
-    width = layout.padded[order[2]]
-    wrap_u, wrap_v = layout.pad[order[1]] == 0, layout.pad[order[2]] == 0
+    track = _track(layout, axis, surface, medium)
     images = _planes(layout.inflow_image, axis) if inflow is not None else None
-    periodic = layout.pad[axis] == 0
 
     def chunk_step(chunk, totals):
         own = jax.tree.map(lambda a: a[chunk], ordinates)
-        length = layout.spacing / jnp.abs(own.direction[:, 0])
         radiance_in = None if inflow is None else inflow.radiance[:, own.index]
+        table, length = track.table(own, 0), track.length(own)
 
-        def plane_step(step, table, rays, totals, keep):
-            plane_number = jnp.where(own.sign > 0, step, count - 1 - step)
-            chords = table.at(step)
-            plane = fields.at(plane_number)
-            entering = None if images is None else _entering(images[plane_number], radiance_in)
-            starts, rays, passing = _cross(rays, chords, plane, length, entering, width, wrap_v, fluence and keep)
-            if not keep:
-                return rays, totals
-            hits, probes, mean = totals
+        def plane_step(step, carry):
+            rays, (hits, probes, mean) = carry
+            number, chords = track.plane(own, step), table.at(step)
+            plane = track.fields.at(number)
+            entering = None if images is None else _entering(images[number], radiance_in)
+            starts, rays, passing = _cross(
+                rays, chords, plane, length, entering, track.width, track.wrap_v, fluence
+            )  # fmt: skip
             if passing is not None:
-                row = lax.dynamic_index_in_dim(mean, plane_number, 0, keepdims=False)
+                row = lax.dynamic_index_in_dim(mean, number, 0, keepdims=False)
                 row = row + jnp.tensordot(own.weight, passing, 1)
-                mean = lax.dynamic_update_index_in_dim(mean, row, plane_number, 0)
+                mean = lax.dynamic_update_index_in_dim(mean, row, number, 0)
             here = (own, starts, chords, plane, length)
-            hits = _read(hits, plane_number, reads.hits, own.hit_bits, *here, _mean_of_hits)
-            probes = _read(probes, plane_number, reads.probes, ~own.probe_bits, *here, _mean_of_paths)
+            hits = _read(hits, number, reads.hits, own.hit_bits, *here, _mean_of_hits)
+            probes = _read(probes, number, reads.probes, ~own.probe_bits, *here, _mean_of_paths)
             return rays, (hits, probes, mean)
 
-        rays = jnp.zeros((own.weight.shape[0], bands, area), real)
-        if periodic:  # enough laps around the torus that what entered at the first no longer matters
-
-            def lap(number, rays):
-                table = _chord_table(own, (number - own.laps + 1) * count, count, width, wrap_v)
-                return lax.fori_loop(0, count, lambda k, r: plane_step(k, table, r, None, False)[0], rays)
-
-            rays = lax.fori_loop(0, own.laps - 1, lap, rays)
-        table = _chord_table(own, 0, count, width, wrap_v)
-        rays, totals = lax.fori_loop(0, count, lambda k, c: plane_step(k, table, *c, True), (rays, totals))
-        return totals
+        rays = jnp.zeros((own.weight.shape[0], bands, track.area), real)
+        if layout.pad[axis] == 0:  # enough laps that what entered at the first no longer matters
+            first = lambda number: (number - own.laps + 1) * track.count
+            rays = lax.fori_loop(0, own.laps - 1, lambda number, r: track.lap(own, first(number), r), rays)
+        return lax.fori_loop(0, track.count, plane_step, (rays, totals))[1]
 
     totals = (
         jnp.zeros((bands, reads.hits.cell.shape[0]), real),
         jnp.zeros((bands, reads.probes.cell.shape[0]), real),
-        jnp.zeros((count, bands, area), real) if fluence else None,
+        jnp.zeros((track.count, bands, track.area), real) if fluence else None,
     )
     return lax.fori_loop(0, ordinates.weight.shape[0], chunk_step, totals)
+
+
+def count_laps(
+    layout: Layout, ordinates: tuple[Ordinates, ...], extinction: Float[Array, "C X Y Z"] | None, most: int
+) -> tuple[tuple[Ordinates, ...], Int[Array, ""]]:
+    """How often rays must go around each periodic axis until less than 1e-6 of their light is left; and the largest such count."""
+    bands = 1 if extinction is None else extinction.shape[0]
+    dark = jnp.zeros((bands, *layout.padded), layout.plane.dtype)
+    medium = None if extinction is None else SweptMedium(extinction, dark)
+
+    def chunk_laps(track: _Track, own: Ordinates):
+        def lap(state):
+            number, rays = state
+            return number + 1, track.lap(own, number * track.count, rays)
+
+        rays = jnp.where(own.weight[:, None, None] > 0, jnp.ones((1, bands, track.area), dark.dtype), 0.0)
+        more = lambda state: (state[0] < most) & (jnp.max(state[1]) > 1e-6)
+        return lax.while_loop(more, lap, (jnp.int32(0), rays))[0] + 1
+
+    counted, longest = [], jnp.int32(1)
+    for axis, own in enumerate(ordinates):
+        if layout.pad[axis] == 0 and own.weight.shape[0]:
+            track = _track(layout, axis, dark, medium)
+            laps = lax.map(lambda chunk, track=track: chunk_laps(track, chunk), own)
+            own, longest = eqx.tree_at(lambda o: o.laps, own, laps), jnp.maximum(longest, laps.max())
+        counted.append(own)
+    return tuple(counted), longest
 
 
 class _ChordTable(NamedTuple):
@@ -268,10 +319,13 @@ def _attenuate(radiance, plane: _Fields, length):
         return radiance, radiance
     tau = plane.extinction * length
     transmittance = jnp.exp(-tau)
+    thin = tau < _THIN
     series = 1 - tau * (0.5 - tau * (1 / 6 - tau * (1 / 24)))
-    mean = jnp.where(tau < _THIN, series, (1 - transmittance) / jnp.maximum(tau, _THIN))
+    mean = jnp.where(thin, series, (1 - transmittance) / jnp.maximum(tau, _THIN))
     excess = radiance - plane.source
-    return plane.source + transmittance * excess, plane.source + mean * excess
+    # The first form keeps the light a thin path adds, the second the light a thick one lets through.
+    end = jnp.where(thin, radiance - tau * mean * excess, plane.source + transmittance * excess)
+    return end, plane.source + mean * excess
 
 
 def _cross(rays, chords: Chords, plane: _Fields, length, entering, width: int, wrap_v: bool, fluence: bool):

@@ -1,0 +1,199 @@
+"""First-flight light: what arrives straight from the sources, before any bounce.
+
+- Suns: sweeps along their exact direction on a grid of ray offsets, so that partly lit voxels and elements count in part.
+- Skies and emitting media, and surfaces that emit over much of the scene: one sweep in the solve's own directions.
+- Small emitting surfaces and point lights: straight to the elements from points on them,
+
+      E(x) = sum over points of  L A cos(theta) cos(theta') T V / r^2       (a point light: I cos(theta) T V / r^2),
+
+  with visibility V by sphere tracing and transmittance T. Their light in the medium's voxels comes by the sweep (point lights:
+  from the points as well).
+
+Public: `Direct`, `first_flight`, `emitter_irradiance`, `small_emitters`.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .layout import Layout
+from .operator import Light, Materials, Transport, make_transport
+from .quadrature import Quadrature
+from .scene import PointLight, Scene, Sky, Sun
+from .surfaces import Surfaces, patch_points
+from .trace import transmittance, visible
+from .transport.characteristic import Inflow
+
+_SUN_OFFSETS = 4  # rays a voxel, a side
+_EMITTER_POINTS = 576
+_SMALL = 0.1  # emitters that cover less of the surfaces than this are sampled by points
+_PAIRS = 1 << 18  # receiver-point pairs at once
+
+
+class Direct(eqx.Module):
+    """First-flight mean radiance (irradiance / pi; fluence / 4 pi): from the suns, and from everything else."""
+
+    sun: Light
+    rest: Light
+
+
+def first_flight(
+    scene: Scene, surfaces: Surfaces, transport: Transport, quadrature: Quadrature, materials: Materials
+) -> Direct:
+    """All light that arrives straight from sources."""
+    layout = transport.layout
+    swept = transport(Light(materials.emission, materials.medium_source), sky_inflow(scene, layout, quadrature))
+    if (points := small_emitters(scene, surfaces)) is not None:
+        # The elements' share of the emitters' light is taken exactly; the sweep's share of it is taken out.
+        unlit = transport(Light(jnp.zeros_like(materials.emission), materials.medium_source),
+                          sky_inflow(scene, layout, quadrature), fluence=False)  # fmt: skip
+        exact = emitter_irradiance(scene, points, surfaces.position, surfaces.normal) / jnp.pi
+        swept = Light(unlit.elements + exact, swept.voxels)
+    for light in scene.lights:
+        if isinstance(light, PointLight):
+            swept = swept + _from_point(scene, surfaces, light)
+    zero = jax.tree.map(jnp.zeros_like, swept)
+    suns = [_from_sun(scene, surfaces, layout, light, materials) for light in scene.lights if isinstance(light, Sun)]
+    return Direct(sun=sum(suns, start=zero), rest=swept)
+
+
+def sky_inflow(scene: Scene, layout: Layout, quadrature: Quadrature) -> Inflow | None:
+    """Radiance of all skies along the swept directions, as each mirror image of an open side sees it."""
+    skies = [light for light in scene.lights if isinstance(light, Sky)]
+    if not skies:
+        return None
+    if layout.unfolding.axes:
+        quadrature = quadrature.mirrored(layout.unfolding.axes)
+    images = []
+    for _, signs in layout.unfolding.images():
+        images.append(sky_radiance(scene, quadrature.directions * signs).T)
+    return Inflow(jnp.stack(images))
+
+
+def sky_radiance(scene: Scene, directions: Float[np.ndarray, "n 3"]) -> Float[Array, "C n"]:
+    """Radiance of all skies along directions of travel."""
+    total = jnp.zeros((scene.bands, len(directions)))
+    for light in scene.lights:
+        if isinstance(light, Sky):
+            radiance = jnp.asarray(light.radiance_along(jnp.asarray(directions, total.dtype)))
+            total = total + (radiance.T if radiance.ndim == 2 else radiance[None])
+    return total
+
+
+def _from_sun(scene: Scene, surfaces: Surfaces, layout: Layout, sun: Sun, materials: Materials) -> Light:
+    side = (np.arange(_SUN_OFFSETS) + 0.5) / _SUN_OFFSETS
+    offsets = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
+    count = len(offsets)
+    direction = np.asarray(sun.direction)
+    beam = Quadrature(np.tile(direction, (count, 1)), np.full(count, 1 / count), offsets, "sun")
+    transport = _beam_transport(layout, beam, materials.extinction, scene.bands)
+    images = layout.unfolding.images()
+    irradiance = jnp.broadcast_to(sun.irradiance, (scene.bands,))
+    # Only the scene itself is lit; a mirror image of it gets what mirrors reflect.
+    here = jnp.array([float(np.all(signs > 0)) for _, signs in images])
+    radiance = here[:, None, None] * jnp.broadcast_to(irradiance, (len(images), count, scene.bands))
+    dark = Light(
+        jnp.zeros_like(materials.emission),
+        None if materials.extinction is None else jnp.zeros_like(materials.extinction),
+    )
+    mean = transport(dark, Inflow(radiance))
+    cosines = sum(np.maximum(-(surfaces.normal * signs) @ direction, 0) for _, signs in images)
+    return Light(mean.elements * jnp.asarray(cosines, radiance.dtype) / jnp.pi, mean.voxels * len(images) / (4 * jnp.pi))
+
+
+def _beam_transport(layout: Layout, beam: Quadrature, extinction, bands: int) -> Transport:
+    # A beam is no quadrature of the sphere: it is swept as it is, not reduced to one side of the mirrors.
+    return make_transport(layout, beam, extinction, bands, mirrored=False)
+
+
+class EmitterPoints(eqx.Module):
+    """Points on emitting surfaces: where they are, their normals, and L A of each."""
+
+    position: Float[np.ndarray, "m 3"]
+    normal: Float[np.ndarray, "m 3"]
+    power: Float[Array, "C m"]  # radiance times area
+
+
+def small_emitters(scene: Scene, surfaces: Surfaces) -> EmitterPoints | None:
+    """Points on the emitting surfaces, if these are a small part of all surfaces; else None."""
+    owners = [*scene.solids, *scene.boundary.sides]
+    emits = np.array([bool(np.any(np.asarray(getattr(o, "emission", 0.0)) > 0)) for o in owners], bool)
+    emitters = np.nonzero(emits[surfaces.material])[0] if len(surfaces) else []
+    if not len(emitters) or surfaces.area[emitters].sum() > _SMALL * surfaces.area.sum():
+        return None
+    side = int(np.ceil(np.sqrt(_EMITTER_POINTS / len(emitters))))
+    spacing = scene.lattice.spacing
+    patch, inside = patch_points(surfaces.normal[emitters], surfaces.offset[emitters], side)
+    center = scene.lattice.lower + (surfaces.voxel[emitters] + 0.5) * spacing
+    position = center[:, None] + patch * spacing
+    normal = np.broadcast_to(surfaces.normal[emitters][:, None], position.shape)
+    # Of a face that is only partly the emitter's, keep that part.
+    behind = np.asarray(scene.distance(jnp.asarray(position - 0.02 * spacing * normal))) < 0
+    flush = (surfaces.side[emitters] >= 0) & (surfaces.material[emitters] < len(scene.solids))
+    keep = inside & (behind | ~flush[:, None])
+    keep[~keep.any(1), 0] = True
+    share = keep / keep.sum(1, keepdims=True)
+    area = (surfaces.area[emitters][:, None] * share)[keep]
+    owner = np.broadcast_to(surfaces.material[emitters][:, None], keep.shape)[keep]
+    radiance = jnp.stack([jnp.broadcast_to(getattr(o, "emission", jnp.zeros(())), (scene.bands,)) for o in owners], 1)
+    return EmitterPoints(position[keep], normal[keep], radiance[:, owner] * jnp.asarray(area, radiance.dtype))
+
+
+def emitter_irradiance(
+    scene: Scene, points: EmitterPoints, position: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]
+) -> Float[Array, "C n"]:
+    """Irradiance at surface points from emitter points, with exact visibility and transmittance."""
+    real = points.power.dtype
+    block = max(1, _PAIRS // len(points.position))
+    count = len(position)
+    padded = -(-count // block) * block
+    spread = lambda a: jnp.asarray(np.concatenate([a, np.repeat(a[-1:], padded - count, 0)]), real).reshape(-1, block, 3)
+    parts = [_pairs(scene, points, p, n) for p, n in zip(spread(position), spread(normal), strict=True)]
+    return jnp.concatenate(parts, axis=1)[:, :count]
+
+
+@eqx.filter_jit
+def _pairs(scene: Scene, points: EmitterPoints, position, normal) -> Float[Array, "C n"]:
+    real = position.dtype
+    clearance = 2e-3 * scene.lattice.spacing
+    start = position + clearance * normal
+    end = jnp.asarray(points.position, real)
+    towards = jnp.asarray(points.normal, real)
+    to = end[None] - start[:, None]
+    squared = jnp.maximum(jnp.sum(to**2, -1), (0.05 * scene.lattice.spacing) ** 2)
+    leaving = -jnp.einsum("nmi,mi->nm", to, towards)
+    arriving = jnp.einsum("nmi,ni->nm", to, normal)
+    geometry = jnp.maximum(leaving, 0.0) * jnp.maximum(arriving, 0.0) / squared**2
+    starts = jnp.broadcast_to(start[:, None], to.shape).reshape(-1, 3)
+    ends = jnp.broadcast_to((end + clearance * towards)[None], to.shape).reshape(-1, 3)
+    passed = geometry.reshape(-1) * visible(scene, starts, ends) * transmittance(scene, starts, ends)
+    return jnp.einsum("cnm,cm->cn", passed.reshape(-1, *geometry.shape), points.power)
+
+
+def _from_point(scene: Scene, surfaces: Surfaces, light: PointLight) -> Light:
+    """First-flight light of a point light, at the elements and at the voxels' centres."""
+    spacing = scene.lattice.spacing
+    clearance = 2e-3 * spacing
+    normal = jnp.asarray(surfaces.normal, float)
+    start = jnp.asarray(surfaces.position, float) + clearance * normal
+    flux, to = _point_flux(scene, light, start)
+    cosine = jnp.einsum("ni,ni->n", to, normal) / jnp.maximum(jnp.linalg.norm(to, axis=1), 1e-30)
+    centers = jnp.asarray(scene.lattice.centers().reshape(-1, 3), float)
+    in_voxels, _ = _point_flux(scene, light, centers)
+    in_voxels = in_voxels.reshape(-1, *scene.lattice.shape) * jnp.asarray(~surfaces.solid)
+    return Light(flux * jnp.maximum(cosine, 0.0) / jnp.pi, in_voxels / (4 * jnp.pi))
+
+
+def _point_flux(scene: Scene, light: PointLight, start: Float[Array, "n 3"]):
+    """I T V / r^2 at some points, and the vectors to the light."""
+    position = jnp.asarray(light.position, start.dtype)
+    to = position - start
+    ends = jnp.broadcast_to(position, start.shape)
+    squared = jnp.maximum(jnp.sum(to**2, -1), (0.5 * scene.lattice.spacing) ** 2)
+    reach = visible(scene, start, ends) * transmittance(scene, start, ends)
+    intensity = jnp.broadcast_to(light.intensity, (scene.bands,))
+    return intensity[:, None] * reach / squared, to

@@ -1,0 +1,105 @@
+"""How much memory a solve takes, and how much there is. Host memory only: an accelerator's own is left out.
+
+The need in bytes, with V voxels (a layer of ghosts included), C bands, E surface elements and D directions:
+
+    need = PROGRAM + 4 V (GEOMETRY + C FIELDS) + E (ELEMENT + C D)
+
+The last term holds the bits that say which directions hit an element. The constants are for 32-bit numbers.
+
+Public names: `estimate_memory`, `available_memory`, `check_memory`, `gigabytes`.
+"""
+
+import os
+from pathlib import Path
+
+PROGRAM = 600_000_000  # Python, JAX, compilation, and the work arrays of a batch
+GEOMETRY = 20  # words a voxel: planes, the samples of the signed distance, copies turned to each axis
+FIELDS_VACUUM = 10  # words a voxel and band: sums of a sweep, fluence of sun, sky and bounces
+FIELDS_MEDIUM = 24  # the same, and coefficients, source, and the iteration's unknowns
+ELEMENT = 1000  # bytes an element: its rows in each axis's reads, position, material
+
+Shape = tuple[int, int, int]
+
+
+def estimate_memory(scene_shape: Shape, bands: int, directions: int, medium: bool, elements: int | None = None) -> int:
+    """Bytes that a solve takes at its peak (module docstring).
+
+    `scene_shape`: voxels along x, y, z. `medium`: whether there is one. `elements`: left out, half as many again as
+    the domain's six sides have.
+    """
+    nx, ny, nz = scene_shape
+    if elements is None:
+        elements = 3 * (nx * ny + ny * nz + nz * nx)
+    fields = GEOMETRY + bands * (FIELDS_MEDIUM if medium else FIELDS_VACUUM)
+    return PROGRAM + 4 * (nx + 2) * (ny + 2) * (nz + 2) * fields + elements * (ELEMENT + bands * directions)
+
+
+def available_memory() -> int | None:
+    """Bytes this process can still take: what the machine has left, or its control group if that is less.
+
+    Where only the machine's whole memory is known, that; None where nothing is.
+    """
+    return min((size for size in (_machine(), *_control_groups()) if size is not None), default=None)
+
+
+def check_memory(scene_shape: Shape, bands: int, directions: int, medium: bool, elements: int | None = None) -> None:
+    """Raise `ValueError` if a solve (arguments of `estimate_memory`) needs more memory than is available."""
+    available = available_memory()
+    need = estimate_memory(scene_shape, bands, directions, medium, elements)
+    if available is None or need <= available:
+        return
+    longest = max(scene_shape)
+    low, high = 0, longest  # the longest side that fits, by halving
+    while high - low > 1:
+        side = (low + high) // 2
+        nx, ny, nz = (max(1, n * side // longest) for n in scene_shape)
+        fits = estimate_memory((nx, ny, nz), bands, directions, medium) <= available
+        low, high = (side, high) if fits else (low, side)
+    advice = f"{low} voxels on the longest side would fit" if low else "free some memory, or use a larger machine"
+    got = f"{' x '.join(map(str, scene_shape))} voxels, which need about {gigabytes(need)}"
+    raise ValueError(f"size: got {got}, expected at most the {gigabytes(available)} available; {advice}")
+
+
+def gigabytes(size: float) -> str:
+    """`size` in bytes, as text."""
+    return f"{size / 1e9:.2f} GB" if size < 1e11 else f"{size / 1e9:.3g} GB"
+
+
+def _machine() -> int | None:
+    for line in _read(Path("/proc/meminfo")).splitlines():
+        if line.startswith("MemAvailable:"):
+            return int(line.split()[1]) * 1024
+    names = ("SC_PHYS_PAGES", "SC_PAGE_SIZE")
+    if not set(names) <= set(getattr(os, "sysconf_names", ())):
+        return None
+    pages, size = (os.sysconf(name) for name in names)
+    return pages * size if pages > 0 else None
+
+
+def _control_groups(root: Path = Path("/sys/fs/cgroup"), own: Path = Path("/proc/self/cgroup")) -> list[int]:
+    """What is left in this process's control groups, of version 2 or 1, and in those around them."""
+    left = []
+    for line in _read(own).splitlines():
+        _, controllers, path = line.split(":", 2)
+        if controllers and "memory" not in controllers.split(","):
+            continue
+        v1 = bool(controllers)
+        top = root / "memory" if v1 else root
+        names = ("memory.limit_in_bytes", "memory.usage_in_bytes") if v1 else ("memory.max", "memory.current")
+        group = top / path.lstrip("/")
+        for folder in (group, *group.parents):
+            limit, usage = (_read(folder / name).strip() for name in names)
+            if limit.isdigit() and usage.isdigit():  # else "max", or no such file
+                # Pages of files count as used, and are given up when needed.
+                stat = dict(row.split(maxsplit=1) for row in _read(folder / "memory.stat").splitlines())
+                left.append(max(0, int(limit) - int(usage) + int(stat.get("inactive_file", 0))))
+            if folder == top:
+                break
+    return left
+
+
+def _read(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:
+        return ""

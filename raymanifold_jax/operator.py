@@ -1,0 +1,167 @@
+"""The transport operator of a scene: from the light that leaves surfaces and medium to the light that arrives.
+
+With the mean arriving radiance E/pi at an element and the mean radiance J = fluence/(4 pi) in a voxel, one coordinate evolution
+is linear in the exitant radiance of the elements and in the source function of the voxels. The unknowns of the solve are
+what surfaces reflect and the medium scatters,
+
+    x = (albedo E / pi,  (scattering / extinction) J),        x = K x + b,
+
+both radiances. Every row of K adds up to at most the largest albedo: arriving radiance is a mean of what was sent.
+
+Public: `Light`, `Transport`, `make_transport`, `Materials`, `materials`.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .layout import Layout, Ordinates, make_ordinates
+from .quadrature import Quadrature
+from .scene import Scene, Wall
+from .surfaces import Surfaces
+from .transport.characteristic import Inflow, SweptMedium, count_laps, mark_hits, sweep
+
+_MOST_LAPS = 1 << 16
+_TRACE = 1e-7  # optical depth a voxel
+
+
+class Light(eqx.Module):
+    """Radiance at the surface elements and in the voxels: what leaves or what arrives, by context.
+
+    `voxels` is None where nobody asks for it (no medium).
+    """
+
+    elements: Float[Array, "C E"]
+    voxels: Float[Array, "C nx ny nz"] | None = None
+
+    def __add__(self, other: Light) -> Light:
+        both = self.voxels is not None and other.voxels is not None
+        voxels = self.voxels + other.voxels if both else other.voxels if self.voxels is None else self.voxels
+        return Light(self.elements + other.elements, voxels)
+
+    def largest(self) -> Float[Array, ""]:
+        """The largest magnitude anywhere."""
+        parts = [self.elements] if self.voxels is None else [self.elements, self.voxels]
+        return jnp.stack([jnp.max(jnp.abs(p), initial=0.0) for p in parts]).max()
+
+
+class Materials(eqx.Module):
+    """Albedo and emitted radiance of the elements, scattering albedo and emission source of the voxels."""
+
+    albedo: Float[Array, "C E"]
+    emission: Float[Array, "C E"]
+    scattering_albedo: Float[Array, "C nx ny nz"] | None
+    medium_source: Float[Array, "C nx ny nz"] | None  # emission / extinction
+    extinction: Float[Array, "C nx ny nz"] | None
+    absorption: Float[Array, "C nx ny nz"] | None
+
+    def reflected(self, arriving: Light) -> Light:
+        """What surfaces reflect and the medium scatters of the light that arrives."""
+        voxels = None
+        if self.scattering_albedo is not None and arriving.voxels is not None:
+            voxels = self.scattering_albedo * arriving.voxels
+        return Light(self.albedo * arriving.elements, voxels)
+
+
+def materials(scene: Scene, surfaces: Surfaces) -> Materials:
+    """The scene's materials on its elements and voxels; differentiable in every value."""
+    bands = scene.bands
+    real = jnp.zeros(0).dtype
+    spread = lambda value: jnp.broadcast_to(jnp.asarray(value, real), (bands,))
+    none = jnp.zeros((bands,), real)
+    owners = [*scene.solids, *(side if isinstance(side, Wall) else None for side in scene.boundary.sides)]
+    albedo = jnp.stack([none if o is None else spread(o.albedo) for o in owners], axis=1)
+    emission = jnp.stack([none if o is None else spread(o.emission) for o in owners], axis=1)
+    owner = jnp.asarray(surfaces.material, np.int32)
+    medium = dict.fromkeys(("scattering_albedo", "medium_source", "extinction", "absorption"))
+    if scene.medium is not None:
+        shape = (*scene.lattice.shape, bands)
+        outside = jnp.asarray(~surfaces.solid)
+        fields = [jnp.moveaxis(jnp.broadcast_to(c, shape), -1, 0) for c in scene.medium.coefficients()]
+        scattering, absorption, source = (jnp.where(outside, f, 0.0).astype(real) for f in fields)
+        # An emitting voxel that neither absorbs nor scatters has no source function: give it a trace of absorption.
+        trace = _TRACE / scene.lattice.spacing
+        absorption = jnp.where((source > 0) & (scattering + absorption < trace), trace, absorption)
+        extinction = scattering + absorption
+        divisor = jnp.where(extinction > 0, extinction, 1.0)
+        medium = {
+            "scattering_albedo": scattering / divisor, "medium_source": source / divisor, "extinction": extinction,
+            "absorption": absorption,
+        }  # fmt: skip
+    return Materials(albedo[:, owner], emission[:, owner], **medium)
+
+
+class Transport(eqx.Module):
+    """K without the albedos: a layout, the directions, the medium's extinction, and the sums of a uniform radiance of 1."""
+
+    layout: Layout
+    ordinates: tuple[Ordinates, Ordinates, Ordinates]
+    extinction: Float[Array, "C X Y Z"] | None
+    element_sums: Float[Array, " E"]
+    voxel_sums: Float[Array, "nx ny nz"]
+
+    @eqx.filter_jit
+    def __call__(self, leaving: Light, inflow: Inflow | None = None, fluence: bool = True) -> Light:
+        """Mean radiance arriving at elements and in voxels, of what leaves them and of what comes in through open sides."""
+        sums = _sweep(self.layout, self.ordinates, self.extinction, leaving, inflow, fluence)
+        elements = _ratio(sums.elements, self.element_sums)
+        return Light(elements, None if sums.voxels is None else _ratio(sums.voxels, self.voxel_sums))
+
+
+def _ratio(sums: Array, furnace: Array) -> Array:
+    return jnp.where(furnace > 0, sums / jnp.where(furnace > 0, furnace, 1.0), 0.0)
+
+
+def _sweep(layout, ordinates, extinction, leaving: Light, inflow: Inflow | None, fluence: bool) -> Light:
+    medium = None
+    if extinction is not None:
+        source = jnp.zeros((extinction.shape[0], *layout.shape), extinction.dtype) if leaving.voxels is None else leaving.voxels
+        medium = SweptMedium(extinction, layout.to_padded(source))
+    return Light(*sweep(layout, ordinates, leaving.elements, medium, inflow, fluence))
+
+
+@eqx.filter_jit
+def _furnace(layout: Layout, ordinates, extinction) -> tuple[tuple, Light]:
+    """Mark the hits, and sweep a uniform radiance of 1."""
+    ordinates = mark_hits(layout, ordinates)
+    first = None if extinction is None else extinction[:1]
+    voxels = None if first is None else jnp.ones((1, *layout.shape), first.dtype)
+    leaving = Light(jnp.ones((1, layout.elements), layout.plane.dtype), voxels)
+    sums = _sweep(layout, ordinates, first, leaving, None, True)
+    return ordinates, Light(sums.elements[0], jnp.where(_solid(layout), 0.0, sums.voxels[0]))
+
+
+def _solid(layout: Layout) -> Array:
+    return layout.from_padded(layout.buried[None].astype(layout.plane.dtype))[0] > 0
+
+
+def make_transport(
+    layout: Layout,
+    quadrature: Quadrature,
+    extinction: Float[Array, "C nx ny nz"] | None,
+    bands: int,
+    mirrored: bool = True,
+) -> Transport:
+    """Prepare the sweeps of one set of directions over a layout.
+
+    With `mirrored`, directions on one side of the mirrors stand for their reflections too; without, they are swept as given.
+
+    **Raises** `ValueError` where rays along a periodic axis never end.
+    """
+    if mirrored and layout.unfolding.axes:
+        quadrature = quadrature.mirrored(layout.unfolding.axes)
+    ordinates = make_ordinates(quadrature, bands)
+    padded = None if extinction is None else layout.to_padded(extinction)
+    if 0 in layout.pad:
+        ordinates, longest = eqx.filter_jit(count_laps)(layout, ordinates, padded, _MOST_LAPS)
+        if not isinstance(longest, jax.core.Tracer) and int(longest) >= _MOST_LAPS:
+            raise ValueError(
+                f"boundary: some rays are still going after {_MOST_LAPS} laps of a periodic axis; expected every ray to meet "
+                "a surface, an open side or an absorbing medium; close or open another side, or add absorption"
+            )
+    ordinates, sums = _furnace(layout, ordinates, padded)
+    return Transport(layout, ordinates, padded, sums.elements, sums.voxels)

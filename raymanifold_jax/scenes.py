@@ -1,0 +1,215 @@
+"""Ready-made scenes, and the cameras that show them.
+
+All fill the unit cube, z up, with n voxels a side:
+
+- `ring`: a ring in an open box under sky and sun, vacuum (Langer, Breton & Zucker 1995, figure 4);
+- `three_balls_in_fog`: three balls in an open box filled with fog, under the sun (figure 5);
+- `room`: a closed room with a block, lit by a square in its ceiling.
+
+`SCENES` lists them by name, with a size to start from and their views; `cameras` makes a scene's views at a resolution.
+Walls are seen from inside only, so a camera outside looks through the wall in front of it.
+
+Public names: `ring`, `three_balls_in_fog`, `room`, `SCENES`, `SceneEntry`, `find`, `cameras`.
+"""
+
+import difflib
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from types import MappingProxyType
+from typing import TypeAlias
+
+from . import checks
+from .camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, Vector
+from .lattice import Lattice
+from .scene import OPEN, Boundary, Medium, Scene, Sky, Solid, Sun, Wall
+from .shapes import Box, Sphere, Torus
+
+Resolution: TypeAlias = tuple[int, int]
+View: TypeAlias = Callable[[Lattice, Resolution], AbstractCamera]
+
+_SMALLEST = 4  # voxels a side: with fewer, nothing is left of the solids
+
+
+def ring(n: int = 128) -> Scene:
+    """A ring, askew above the floor of an open box: albedo 0.9 throughout, sky of radiance 1 and an oblique sun.
+
+    The ring's shadow falls on the floor, and is lit by the sky and by what ring and walls reflect.
+
+    **Arguments:** `n`: voxels a side, >= 4. **Raises** `TypeError` or `ValueError` for anything else.
+    """
+    torus = Torus((0.5, 0.5, 0.36), major_radius=0.22, minor_radius=0.08, axis=(-0.4, 0.25, 1))
+    return Scene(
+        _unit_cube(n),
+        solids=[Solid(torus, albedo=0.9)],
+        lights=[Sky(radiance=1.0), Sun(direction=(0.3, 0.2, -1), irradiance=4.0)],
+        boundary=_open_box(albedo=0.9),
+    )
+
+
+def three_balls_in_fog(n: int = 128) -> Scene:
+    """Three balls in an open box full of fog, under a sun alone: surfaces of albedo 0.9, scattering 3, absorption 0.3.
+
+    The balls, of radius 0.12, hang at heights 0.75, 0.5 and 0.25; the sun's irradiance across its beam is 3.
+
+    **Arguments:** `n`: voxels a side, >= 4. **Raises** `TypeError` or `ValueError` for anything else.
+    """
+    centers = ((0.3, 0.35, 0.75), (0.65, 0.3, 0.5), (0.5, 0.7, 0.25))
+    return Scene(
+        _unit_cube(n),
+        solids=[Solid(Sphere(center, 0.12), albedo=0.9) for center in centers],
+        medium=Medium(scattering=3.0, absorption=0.3),
+        lights=[Sun(direction=(0.2, 0.1, -1), irradiance=3.0)],
+        boundary=_open_box(albedo=0.9),
+    )
+
+
+def room(n: int = 64, black_light: bool = False) -> Scene:
+    """A closed room of albedo 0.75 with a block of the same on its floor, lit by a square in its ceiling.
+
+    The block is [0.25, 0.5]² × [0, 0.5]; the light, [0.375, 0.625]² at z = 1, emits radiance 1. Multiples of 8 put all
+    faces on faces of voxels, which is the most accurate; other sizes work too.
+
+    **Arguments:** `n`: voxels a side, >= 4. `black_light`: the light has albedo 0, not 0.75.
+    **Raises** `TypeError` or `ValueError` for anything else.
+    """
+    lattice = _unit_cube(n)
+    checks.instance("black_light", black_light, bool, "pass True or False")
+    wall = Wall(albedo=0.75)
+    # Behind the ceiling and flush with it: the ceiling's light-coloured part is this box's lower face.
+    light = Box((0.375, 0.375, 1), (0.625, 0.625, 1.125))
+    return Scene(
+        lattice,
+        solids=[
+            Solid(Box((0.25, 0.25, 0), (0.5, 0.5, 0.5)), albedo=0.75),
+            Solid(light, albedo=0.0 if black_light else 0.75, emission=1.0),
+        ],
+        boundary=Boundary(x=wall, y=wall, z=wall),
+    )
+
+
+@dataclass(frozen=True)
+class SceneEntry:
+    """A scene that has a name: `build(n)` makes it with n voxels a side, `views` are its cameras, the default first."""
+
+    name: str
+    build: Callable[[int], Scene]
+    description: str
+    default_size: int
+    views: Mapping[str, View] = field(repr=False)
+
+
+def find(name: str) -> SceneEntry:
+    """The entry of `SCENES` with this name, in any case, with - or _; `three_balls_in_fog` is known as well.
+
+    **Raises** `ValueError` for any other name, `TypeError` if it is not a string.
+    """
+    checks.instance("scene", name, str, 'pass a name, as in "ring"')
+    wanted = name.lower().replace("_", "-")
+    wanted = _ALIASES.get(wanted, wanted)
+    if wanted in SCENES:
+        return SCENES[wanted]
+    near = difflib.get_close_matches(wanted, [*SCENES, *_ALIASES], n=1, cutoff=0.5)
+    advice = f"did you mean {_ALIASES.get(near[0], near[0])!r}?" if near else "pass one of these names"
+    checks.fail("scene", repr(name), f"one of {', '.join(SCENES)}", advice)
+
+
+def cameras(name: str, scene: Scene, resolution: Resolution = (512, 512)) -> dict[str, AbstractCamera]:
+    """The views of the scene `name`, by name, the default first; row 0 of their pictures is the top.
+
+    **Arguments:** `scene`: what `SCENES[name].build` made. `resolution`: (width, height) in pixels; whatever its
+    proportions, the whole scene is in the picture and pixels are square.
+
+    **Raises** `ValueError` for an unknown name, `ValueError` or `TypeError` for a resolution that is not two positive
+    ints.
+    """
+    checks.instance("scene", scene, Scene, "pass the scene itself, as in cameras('ring', ring(64))")
+    return {view: make(scene.lattice, resolution) for view, make in find(name).views.items()}
+
+
+def _unit_cube(n: int) -> Lattice:
+    n = checks.positive_int("n", n, at_least=_SMALLEST)
+    return Lattice((n, n, n), spacing=1 / n)
+
+
+def _open_box(albedo: float) -> Boundary:
+    wall = Wall(albedo=albedo)
+    return Boundary(x=wall, y=wall, z=(wall, OPEN))
+
+
+def _parallel(
+    center: Vector, direction: Vector, up: Vector, extent: tuple[float, float], resolution: Resolution
+) -> OrthographicCamera:
+    """A parallel projection with `extent` (across, up) in the picture."""
+    # The proportions are the camera's to check: it is made with some width first, so that it can.
+    camera = OrthographicCamera(center, direction, up, width=extent[0], resolution=resolution)
+    width = max(extent[0], extent[1] * camera.resolution[0] / camera.resolution[1])
+    return OrthographicCamera(center, direction, up, width=width, resolution=resolution)
+
+
+def _top(lattice: Lattice, resolution: Resolution) -> OrthographicCamera:
+    x, y, _ = (lattice.lower + lattice.upper) / 2
+    across, upward, _ = lattice.extent
+    return _parallel((x, y, lattice.upper[2]), (0, 0, -1), (0, 1, 0), (across, upward), resolution)
+
+
+def _oblique(azimuth: float, elevation: float, lattice: Lattice, resolution: Resolution) -> OrthographicCamera:
+    """A parallel projection from a side, `azimuth` (degrees from +x), looking down on the middle of the box."""
+    a, e = math.radians(azimuth), math.radians(elevation)
+    x, y, z = (lattice.lower + lattice.upper) / 2
+    side = max(lattice.extent)
+    towards = (math.cos(a) * math.cos(e), math.sin(a) * math.cos(e), math.sin(e))
+    # Two sides away the picture plane is outside the box everywhere.
+    center = (x + 2 * side * towards[0], y + 2 * side * towards[1], z + 2 * side * towards[2])
+    # The floor's depth and the walls' height, foreshortened, and a margin.
+    margin = 1.03 * side
+    extent = (margin, margin * (math.sin(e) + math.cos(e)))
+    return _parallel(center, (-towards[0], -towards[1], -towards[2]), (0, 0, 1), extent, resolution)
+
+
+def _front(
+    position: Vector, target: Vector, field_of_view: float, lattice: Lattice, resolution: Resolution
+) -> PerspectiveCamera:
+    """A perspective from the front (-y), with `field_of_view` in degrees across the smaller side of the picture."""
+    camera = PerspectiveCamera(position, target, field_of_view=field_of_view, resolution=resolution)
+    narrow = camera.resolution[1] / min(camera.resolution)
+    height = 2 * math.degrees(math.atan(narrow * math.tan(math.radians(field_of_view) / 2)))
+    return PerspectiveCamera(position, target, field_of_view=height, resolution=resolution)
+
+
+_FROM_FOUR_SIDES: dict[str, View] = {
+    side: partial(_oblique, azimuth, 50.0)
+    for side, azimuth in {"south": -90.0, "east": 0.0, "north": 90.0, "west": 180.0}.items()
+}
+
+#: The scenes by name.
+SCENES: Mapping[str, SceneEntry] = MappingProxyType(
+    {
+        entry.name: entry
+        for entry in (
+            SceneEntry(
+                "ring",
+                ring,
+                "a ring in an open box under sky and sun (the paper's figure 4)",
+                128,
+                {**_FROM_FOUR_SIDES, "top": _top},
+            ),
+            SceneEntry(
+                "three-balls",
+                three_balls_in_fog,
+                "three balls in an open box full of fog, under the sun (figure 5)",
+                128,
+                {"front": partial(_front, (0.5, -1.9, 0.95), (0.5, 0.5, 0.47), 34.0), "top": _top},
+            ),
+            SceneEntry(
+                "room",
+                room,
+                "a closed room with a block, lit by a square in its ceiling",
+                64,
+                {"front": partial(_front, (0.5, -1.75, 0.5), (0.5, 0.5, 0.5), 34.0), "top": _top},
+            ),
+        )
+    }
+)
+_ALIASES = {"three-balls-in-fog": "three-balls"}

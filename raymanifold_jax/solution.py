@@ -1,0 +1,137 @@
+"""What a solve returns: the light everywhere, and how far it can be trusted.
+
+Public: `Solution`, `SurfaceTable`, `Energy`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from .scene import Scene
+from .surfaces import Surfaces
+
+
+class SurfaceTable(NamedTuple):
+    """One row for each surface element, in scene units and W m^-2; trailing band axis where the scene has bands."""
+
+    positions: Float[jax.Array, "E 3"]
+    normals: Float[jax.Array, "E 3"]
+    areas: Float[jax.Array, " E"]
+    albedo: Float[jax.Array, " E *bands"]
+    irradiance: Float[jax.Array, " E *bands"]
+    radiosity: Float[jax.Array, " E *bands"]
+
+
+class Energy(NamedTuple):
+    """Where the power goes, in W (all bands together).
+
+    `emitted` by surfaces, medium and point lights plus `entering` through open sides from sky and suns should equal `absorbed_by_surfaces` plus
+    `absorbed_by_medium` plus `leaving` through open sides. `imbalance` is the difference over the power put in.
+    """
+
+    emitted: Float[jax.Array, ""]
+    entering: Float[jax.Array, ""]
+    absorbed_by_surfaces: Float[jax.Array, ""]
+    absorbed_by_medium: Float[jax.Array, ""]
+    leaving: Float[jax.Array, ""]
+
+    @property
+    def imbalance(self) -> Float[jax.Array, ""]:
+        put_in = self.emitted + self.entering
+        got_out = self.absorbed_by_surfaces + self.absorbed_by_medium + self.leaving
+        return (put_in - got_out) / jnp.where(put_in > 0, put_in, 1.0)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Hidden:
+    """Static data that jit compares by identity."""
+
+    surfaces: Surfaces
+
+    def __hash__(self) -> int:
+        return id(self.surfaces)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Hidden) and other.surfaces is self.surfaces
+
+
+class Solution(eqx.Module):
+    """The light in a scene.
+
+    - `fluence`: (nx, ny, nz[, bands]), W m^-2, the mean over the part of each voxel outside solids; 0 inside.
+    - `surfaces`: positions, normals, areas, albedo, irradiance, radiosity, one row for each element.
+    - `energy`: the power balance and its imbalance.
+    - `error_bound`: certified: no radiosity, and no medium source times pi, is further than this from the exact solution of
+      the discrete problem (in radiosity units; rounding apart). inf where no bound is known.
+    - `sweeps`: applications of the transport operator on the full lattice. `history`: the largest change in each sweep, in
+      radiosity units. `result`: how the iteration ended, in words; `converged`: whether it met the tolerance.
+    - `diffuse_*` and `sun_*`: (bands, ...), the light of the suns' direct beams, and all other light.
+    """
+
+    scene: Scene
+    diffuse_irradiance: Float[jax.Array, "C E"]
+    sun_irradiance: Float[jax.Array, "C E"]
+    diffuse_fluence: Float[jax.Array, "C nx ny nz"]
+    sun_fluence: Float[jax.Array, "C nx ny nz"]
+    free: Float[jax.Array, "nx ny nz"]
+    albedo: Float[jax.Array, "C E"]
+    emission: Float[jax.Array, "C E"]
+    energy: Energy
+    error_bound: float = eqx.field(static=True)
+    target: float = eqx.field(static=True)
+    history: np.ndarray
+    sweeps: int = eqx.field(static=True)
+    converged: bool = eqx.field(static=True)
+    stagnated: bool = eqx.field(static=True)
+    _hidden: _Hidden = eqx.field(static=True)
+
+    @property
+    def elements(self) -> Surfaces:
+        """The surface elements' geometry, as numpy arrays."""
+        return self._hidden.surfaces
+
+    @property
+    def fluence(self) -> Float[jax.Array, "nx ny nz *bands"]:
+        return self._banded(self.diffuse_fluence + self.sun_fluence)
+
+    @property
+    def surfaces(self) -> SurfaceTable:
+        """The elements of solids and walls (those of open sides: `outgoing_flux`)."""
+        kept = np.nonzero(~self.elements.open)[0]
+        irradiance = (self.diffuse_irradiance + self.sun_irradiance)[:, kept]
+        radiosity = self.albedo[:, kept] * irradiance + jnp.pi * self.emission[:, kept]
+        real = irradiance.dtype
+        geometry = (self.elements.position, self.elements.normal, self.elements.area)
+        return SurfaceTable(
+            *(jnp.asarray(a[kept], real) for a in geometry),
+            self._banded(self.albedo[:, kept]),
+            self._banded(irradiance),
+            self._banded(radiosity),
+        )
+
+    @property
+    def result(self) -> str:
+        """How the iteration ended."""
+        bound, target, count = self.error_bound, self.target, self.sweeps
+        if self.converged:
+            return f"converged: error bound {bound:.3g} is within the target {target:.3g} after {count} sweeps"
+        if not np.isfinite(bound):
+            ending = "no error bound: some light bounces without loss; lower an albedo below 1, or open a side"
+        elif self.stagnated:
+            ending = f"stagnated at the float type's rounding; raise rtol, or enable float64 (bound {bound:.3g}, target {target:.3g})"
+        else:
+            ending = f"sweep limit reached; raise max_sweeps or rtol (bound {bound:.3g}, target {target:.3g})"
+        return f"not converged after {count} sweeps: {ending}"
+
+    def _banded(self, values: Float[jax.Array, "C *shape"]) -> Float[jax.Array, "*shape C"]:
+        return jnp.moveaxis(values, 0, -1) if self.scene.banded else values[0]
+
+    def __repr__(self) -> str:
+        return f"Solution({self.scene.summary()}; {self.result})"
