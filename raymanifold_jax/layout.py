@@ -89,6 +89,10 @@ class Layout(eqx.Module):
     inflow_image: Int[Array, "X Y Z"]  # which mirror image an open ghost voxel belongs to; -1: not open
     reads: tuple[AxisReads, AxisReads, AxisReads]
 
+    def padded_along(self, axis: int) -> tuple[int, int, int]:
+        """The padded shape, sweep axis first."""
+        return tuple(self.padded[a] for a in AXES[axis])
+
     def to_padded(self, field: Float[Array, "C nx ny nz"]) -> Float[Array, "C X Y Z"]:
         """Unfold a field of the scene's lattice and give it ghost voxels (0)."""
         return jnp.pad(self.unfolding.unfold(field), ((0, 0), *((p, p) for p in self.pad)))

@@ -34,7 +34,7 @@ from . import checks
 from .scene import MIRROR, OPEN, PERIODIC, Scene
 
 _BLOCK = 1 << 14  # rays a call
-_BUNDLE = 1 << 9  # rays that step together: neighbours end at about the same time
+_BUNDLE = 1 << 10  # rays that step together: neighbours end at about the same time
 _PASSES = 64  # images of the lattice that a ray crosses at most
 _STEPS = 1024  # of sphere tracing
 _TOUCH = 1e-4  # voxels: nearer is a hit
@@ -289,7 +289,8 @@ def _sphere_trace(scene: Scene, axes: tuple[_Axis, ...], start: Array, w: Array,
         t = jnp.where(stopped, t, jnp.minimum(t + ahead, leave))
         return t, near, stopped | (t >= leave), count + 1
 
-    first = jnp.full_like(leave, nudge if folds else 0.0)
+    # A start on a surface is past it: seen from behind, a flush solid does not stop the ray.
+    first = jnp.full_like(leave, 2 * _CRAWL + (nudge if folds else 0.0))
     state = (jnp.minimum(first, leave), jnp.full_like(leave, jnp.inf), leave <= 0, 0)
     most = _STEPS * (8 if folds else 1)
     t, near, done, _ = lax.while_loop(lambda s: ~s[2].all() & (s[3] < most), step, state)

@@ -134,7 +134,7 @@ def _track(layout: Layout, axis: int, surface: Float[Array, "C X Y Z"], medium: 
         extinction=None if medium is None else _planes(medium.extinction, axis),
         source=None if medium is None else _planes(medium.source, axis),
     )
-    count, height, width = (layout.padded[a] for a in order)
+    count, height, width = layout.padded_along(axis)
     return _Track(fields, count, height * width, width, layout.pad[order[2]] == 0, layout.spacing)
 
 
@@ -426,12 +426,13 @@ def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinat
 
 def _hit_bits(layout: Layout, axis: int, chunk: Ordinates, reads: Reads) -> UInt32[Array, " M"]:
     order = AXES[axis]
-    count, height, width = (layout.padded[a] for a in order)
+    count, height, width = layout.padded_along(axis)
     wrap_v = layout.pad[order[2]] == 0
-    # Ghost voxels emit at their faces, so what leaves them is never inside a solid.
-    open_air = jnp.where(layout.buried, -1.0, jnp.where(layout.plane[0] <= -1.0, 1.0, layout.plane[0]))
-    normals = [_planes(layout.plane[1 + a], axis) for a in order]
-    geometry = [_planes(open_air, axis), *normals]
+    offsets = jnp.where(layout.buried, -1.0, layout.plane[0])
+    geometry = [_planes(offsets, axis), *(_planes(layout.plane[1 + a], axis) for a in order)]
+    rim = [jnp.arange(n) for n in (count, height, width)]
+    rim = [(r == 0) | (r == n - 1) if layout.pad[a] else r < 0 for r, n, a in zip(rim, layout.padded_along(axis), order, strict=True)]
+    ghost = (rim[0][:, None, None] | rim[1][:, None] | rim[2]).reshape(count, -1)
 
     def one(face, home):
         plane, cell = home
@@ -449,7 +450,9 @@ def _hit_bits(layout: Layout, axis: int, chunk: Ordinates, reads: Reads) -> UInt
             back = (jnp.full_like(ends[0][0], step), along_u.astype(face.dtype), along_v.astype(face.dtype))
             e = [x + y for x, y in zip(ends[0], back, strict=True)]
             above = inside[0] + inside[1] * e[0] + inside[2] * e[1] + inside[3] * e[2]
-            found, clean = found | hit, clean & (~hit | (above > -1e-3))
+            # Ghost voxels emit at their faces: what leaves them for the lattice has not been inside a solid.
+            emitted = ghost[(plane - step) % count, before] & ~ghost[plane, cell]
+            found, clean = found | hit, clean & (~hit | (above > -1e-3) | emitted)
         flags = (found & clean).astype(jnp.uint32)
         return jnp.sum(flags << jnp.arange(flags.shape[0], dtype=jnp.uint32), dtype=jnp.uint32)
 

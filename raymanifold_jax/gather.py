@@ -1,0 +1,333 @@
+"""Light at points and along rays, from a finished solution.
+
+Surfaces reflect the interpolated irradiance of their elements and, exactly, each sun's: a shadow ray finds whether it is
+lit. With albedo rho and emitted radiance L_e, a ray that ends on a surface behind transmittance T sees
+
+    L = T (rho / pi (E + sum over suns) + L_e) + what the medium scatters and emits on the way,
+
+and one that leaves sees T times the sky. The sun's disc itself is not seen.
+
+Public names: `radiance`, `irradiance`, `fluence`, `outgoing_flux`; `surface_radiance` and `LightField` for this package.
+"""
+
+from __future__ import annotations
+
+import itertools
+import weakref
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from . import checks
+from .direct import emitter_irradiance, sky_radiance, small_emitters
+from .interpolation import ElementTable, element_table, interpolate_irradiance, slopes
+from .scene import MIRROR, OPEN, PERIODIC, PointLight, Scene, Sun, Wall
+from .solution import Solution
+from .trace import Hit, _first_hit, _march, _passed, _sloped, _to_voxel, fill, in_blocks, interpolate, transmittance, visible
+
+_OFF = 2e-3  # voxels: how far off a surface rays start
+_DEEP = 0.5  # voxels: how far inside a solid a point on its surface may be by mistake
+_POINTS = 256  # points of a final gather at once
+_SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
+
+
+class LightField(eqx.Module):
+    """A solution made ready to be looked up: fields without gaps, elements by voxel, materials by index."""
+
+    scene: Scene
+    diffuse: Float[Array, "C nx ny nz"]
+    fluence: Float[Array, "C nx ny nz"]
+    table: ElementTable
+    irradiance: Float[Array, "E C"]
+    slope: Float[Array, "E C 3"]
+    albedo: Float[Array, "M C"]
+    emission: Float[Array, "M C"]
+
+
+def radiance(solution: Solution, origins: Any, directions: Any) -> Float[Array, "n *bands"]:
+    """What an eye at `origins` sees along `directions`, (n, 3) each, in W m^-2 sr^-1.
+
+    Directions may have any length but 0. Walls are seen from inside only: an eye outside the lattice looks through those
+    in front of it.
+
+    **Raises** `ValueError` for NaN, another shape, a direction of length 0, or an origin inside a solid.
+    """
+    origins, directions = _rays(origins, directions, "origins", "directions")
+    check_outside(solution.scene, "origins", origins)
+    return _banded(solution.scene, in_blocks(radiance_along, light_field(solution), (origins, directions)))
+
+
+def irradiance(solution: Solution, points: Any, normals: Any, directions: int = 1024) -> Float[Array, "n *bands"]:
+    """Irradiance at surface points by a final gather, (n, 3) each, in W m^-2.
+
+    The mean of the radiance over `directions` directions spread over the hemisphere around each normal, and the light
+    of suns, point lights and small emitting surfaces exactly. The normals may have any length but 0. Points up to half
+    a voxel inside a solid or outside the lattice are taken to be on the surface.
+
+    **Raises** `ValueError` for NaN, another shape, a normal of length 0, or points further inside.
+    """
+    points, normals = _rays(points, normals, "points", "normals")
+    number = checks.positive_int("directions", directions)
+    scene, spacing = solution.scene, solution.scene.lattice.spacing
+    points = _lift(scene, points, normals)
+    field = light_field(solution)
+    emitters = small_emitters(scene, solution.elements) if not _has_images(scene) else None
+    if emitters is not None:
+        field = eqx.tree_at(lambda f: f.emission, field, jnp.zeros_like(field.emission))
+    local = _hemisphere(number)
+    parts = []
+    for i in range(0, len(points), _POINTS):
+        block, normal = points[i : i + _POINTS], normals[i : i + _POINTS]
+        rays = np.einsum("dj,nji->ndi", local, _frames(normal)).reshape(-1, 3)
+        seen = in_blocks(radiance_along, field, (np.repeat(block, number, 0), rays))
+        parts.append(jnp.pi * seen.reshape(len(block), number, -1).mean(1))
+    total = jnp.concatenate(parts) if parts else jnp.zeros((0, scene.bands))
+    total = total + in_blocks(_sun_irradiance, scene, (points, normals))
+    if emitters is not None and len(points):
+        total = total + emitter_irradiance(scene, emitters, points - _OFF * spacing * normals, normals).T
+    for light in scene.lights:
+        if isinstance(light, PointLight):
+            total = total + _point_light(scene, light, points, normals)
+    return _banded(scene, total)
+
+
+def fluence(solution: Solution, points: Any) -> Float[Array, "n *bands"]:
+    """Fluence at points (n, 3) of the space that solids leave free, in W m^-2: interpolated, with the suns' exactly.
+
+    **Raises** `ValueError` for NaN, another shape, or points outside the lattice or inside a solid.
+    """
+    points, scene = checks.points("points", points), solution.scene
+    if isinstance(points, np.ndarray):
+        outside = ~np.asarray(scene.lattice.contains(points))
+        if outside.any():
+            at = int(np.argmax(outside))
+            advice = "there is no medium and no voxel there: leave it out"
+            checks.fail(f"points[{at}]", points[at].tolist(), f"a point of the lattice, {_box(scene)}", advice)
+    check_outside(scene, "points", points)
+    return _banded(scene, in_blocks(_fluence_at, light_field(solution), (points,)))
+
+
+def outgoing_flux(solution: Solution, side: str) -> Float[Array, "nu nv *bands"]:
+    """Power per area that leaves through an open side, in W m^-2, one value for each voxel's face.
+
+    `side` is one of x-, x+, y-, y+, z-, z+; axes are the other two in increasing order: z+ gives (nx, ny). Where a solid
+    covers part of a face, the mean over the whole face: the sum times the face's area is the power that leaves.
+
+    **Raises** `ValueError` for another name or a side that is not OPEN.
+    """
+    if side not in _SIDES:
+        checks.fail("side", repr(side), f"one of {', '.join(_SIDES)}", 'the upper side of z is "z+"')
+    number, scene, elements = _SIDES.index(side), solution.scene, solution.elements
+    kind = scene.boundary.sides[number]
+    if kind is not OPEN:
+        advice = "no light leaves through others; make it OPEN in Boundary(...)"
+        checks.fail("side", f"{side}, which is {'a Wall' if isinstance(kind, Wall) else kind!r}", "an OPEN side", advice)
+    kept = np.nonzero(elements.open & (elements.side == number))[0]
+    u, v = (axis for axis in range(3) if axis != number // 2)
+    share = jnp.asarray(elements.area[kept] / scene.lattice.spacing**2, solution.diffuse_irradiance.dtype)
+    values = (solution.diffuse_irradiance + solution.sun_irradiance)[:, kept] * share
+    flux = jnp.zeros((scene.lattice.shape[u], scene.lattice.shape[v], scene.bands), values.dtype)
+    flux = flux.at[elements.voxel[kept, u], elements.voxel[kept, v]].add(values.T)
+    return flux if scene.banded else flux[..., 0]
+
+
+# Looking up
+
+_fields: dict[int, tuple[weakref.ref, LightField]] = {}
+
+
+def light_field(solution: Solution) -> LightField:
+    """The solution made ready; made once for each."""
+    known = _fields.get(id(solution))
+    if known is not None and known[0]() is solution:
+        return known[1]
+    checks.instance("solution", solution, Solution, "pass what rm.solve(scene) returns")
+    field = _light_field(solution)
+    if not checks.is_traced(solution):
+        key = id(solution)
+        _fields[key] = (weakref.ref(solution, lambda _: _fields.pop(key, None)), field)
+    return field
+
+
+def _light_field(solution: Solution) -> LightField:
+    scene, bands = solution.scene, solution.scene.bands
+    owners = [*scene.solids, *(side if isinstance(side, Wall) else None for side in scene.boundary.sides)]
+    real = solution.diffuse_irradiance.dtype
+    spread = lambda o, name: jnp.broadcast_to(jnp.asarray(0.0 if o is None else getattr(o, name), real), (bands,))
+    diffuse = fill(solution.diffuse_fluence, solution.free)
+    table = element_table(scene, solution.elements)
+    values = solution.diffuse_irradiance.T if len(solution.elements) else jnp.zeros((1, bands), real)
+    return LightField(
+        scene=scene,
+        diffuse=diffuse,
+        fluence=diffuse + fill(solution.sun_fluence, solution.free),
+        table=table,
+        irradiance=values,
+        slope=slopes(scene, table, values),
+        albedo=jnp.stack([spread(o, "albedo") for o in owners]),
+        emission=jnp.stack([spread(o, "emission") for o in owners]),
+    )
+
+
+def surface_radiance(field: LightField, hit: Hit) -> Float[Array, "n C"]:
+    """Radiance that leaves the surfaces at hits, in every direction; 0 where there is none."""
+    scene = field.scene
+    u = _to_voxel(scene, hit.point)
+    arriving = interpolate_irradiance(scene, field.table, field.irradiance, field.slope, u, hit.normal)
+    arriving = arriving + _sun_irradiance(scene, hit.point + _OFF * scene.lattice.spacing * hit.normal, hit.normal)
+    material = jnp.maximum(hit.material, 0)
+    leaving = field.albedo[material] / jnp.pi * arriving + field.emission[material]
+    return jnp.where((hit.material >= 0)[:, None], leaving, 0.0)
+
+
+def radiance_along(field: LightField, origins: Array, directions: Array) -> Float[Array, "n C"]:
+    """`radiance` for one block of rays with directions of length 1."""
+    scene = field.scene
+    hit = _first_hit(scene, origins, directions)
+    behind = jnp.where((hit.material >= 0)[:, None], surface_radiance(field, hit), sky_radiance(scene, -hit.direction).T)
+    if scene.medium is None:
+        return behind
+    added, passed = _march((scene, field.fluence), origins, directions, hit.enter, hit.distance)
+    return added + passed * behind
+
+
+def _fluence_at(field: LightField, points: Array) -> Float[Array, "n C"]:
+    scene = field.scene
+    return interpolate(scene, field.diffuse, _to_voxel(scene, points)) + _sun_light(scene, points, None)
+
+
+def _sun_irradiance(scene: Scene, points: Array, normals: Array) -> Float[Array, "n C"]:
+    return _sun_light(scene, points, normals)
+
+
+def _sun_light(scene: Scene, points: Array, normals: Array | None) -> Float[Array, "n C"]:
+    """Direct light of all suns at points off the surfaces: irradiance, or fluence without normals."""
+    total = jnp.zeros((len(points), scene.bands), points.dtype)
+    sides = scene.boundary.sides
+    mirrors = [axis for axis in range(3) if MIRROR in sides[2 * axis : 2 * axis + 2]]
+    for sun in scene.lights:
+        if not isinstance(sun, Sun):
+            continue
+        direction = jnp.asarray(sun.direction, points.dtype)
+        for flips in itertools.product((False, True), repeat=len(mirrors)):
+            # By mirrors, beams arrive along reflected directions as well; each path is looked for once.
+            sign, share = jnp.ones(3, points.dtype), jnp.ones((), points.dtype)
+            for axis, flipped in zip(mirrors, flips, strict=True):
+                if flipped:
+                    sign = sign.at[axis].set(-1.0)
+                    share = jnp.where(direction[axis] == 0, 0.0, share)
+            travel = direction * sign
+            back = jnp.broadcast_to(-travel, points.shape)
+            lit = _sunlit(scene, points, back, -direction) * share
+            if normals is not None:
+                lit = lit * jnp.maximum(-(normals @ travel), 0.0)[:, None]
+            total = total + lit * jnp.broadcast_to(sun.irradiance, (scene.bands,)).astype(points.dtype)
+    return total
+
+
+def _sunlit(scene: Scene, points: Array, back: Array, towards: Array) -> Float[Array, "n C"]:
+    """Transmittance to the sun, 0 in shadow: the ray back must leave through an open side, straight towards it."""
+    hit = _first_hit(scene, points, back)
+    lit = (hit.material < 0) & (jnp.abs(hit.direction - towards).max(-1) < 1e-6)
+    if scene.medium is None:
+        return jnp.broadcast_to(lit[:, None], (len(points), scene.bands)).astype(points.dtype)
+    spacing = scene.lattice.spacing
+    reach = jnp.where(lit, hit.distance, 0.0) / spacing
+    enter = jnp.where(lit, hit.enter, 0.0) / spacing
+    passed = _passed(scene, _to_voxel(scene, points), _sloped(back), enter, jnp.maximum(reach, enter))
+    return jnp.where(lit[:, None], passed, 0.0)
+
+
+def _point_light(scene: Scene, light: PointLight, points: np.ndarray, normals: np.ndarray) -> Float[Array, "n C"]:
+    """Irradiance I T V cos / r^2 from a point light."""
+    to = np.asarray(light.position) - points
+    squared = np.maximum((to**2).sum(-1), 1e-30)
+    geometry = np.maximum((to * normals).sum(-1), 0.0) / squared**1.5
+    ends = np.broadcast_to(np.asarray(light.position), points.shape)
+    reach = visible(scene, points, ends) * transmittance(scene, points, ends) * jnp.asarray(geometry, float)
+    return reach.T * jnp.broadcast_to(light.intensity, (scene.bands,))
+
+
+def _has_images(scene: Scene) -> bool:
+    return any(side in (MIRROR, PERIODIC) for side in scene.boundary.sides)
+
+
+def _banded(scene: Scene, values: Float[Array, "n C"]) -> Float[Array, "n *bands"]:
+    return values if scene.banded else values[:, 0]
+
+
+# Points, directions and what can be wrong with them
+
+
+def check_outside(scene: Scene, name: str, points: Any) -> None:
+    """Raise `ValueError` if any of `points` (n, 3) is inside a solid."""
+    _check_depth(scene, name, points, 0.01, "outside the solids", "move it out of the solid")
+
+
+def _check_depth(scene: Scene, name: str, points: Any, deepest: float, expected: str, advice: str) -> None:
+    if not scene.solids or checks.is_traced((scene, points)) or not len(points):
+        return
+    depth = -np.asarray(in_blocks(Scene.distance, scene, (points,))) / scene.lattice.spacing
+    at = int(np.argmax(depth))
+    if depth[at] > deepest:
+        solid = int(scene.solid_at(jnp.asarray(points[at], float)))
+        got = f"{np.asarray(points[at]).tolist()}, {depth[at]:.3g} voxels inside solids[{solid}]"
+        checks.fail(f"{name}[{at}]", got, f"a point {expected}", advice)
+
+
+def _rays(points: Any, vectors: Any, points_name: str, vectors_name: str) -> tuple[Any, Any]:
+    """Both checked, the vectors scaled to length 1."""
+    points, vectors = checks.points(points_name, points), checks.points(vectors_name, vectors)
+    if points.shape != vectors.shape:
+        got = f"shapes {points.shape} and {vectors.shape}"
+        checks.fail(f"{points_name} and {vectors_name}", got, "as many of one as of the other", "repeat the shorter one")
+    if not isinstance(vectors, np.ndarray):
+        return points, vectors / jnp.linalg.norm(vectors, axis=-1, keepdims=True)
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    if (length == 0).any():
+        at = int(np.argmin(length))
+        checks.fail(f"{vectors_name}[{at}]", vectors[at].tolist(), "a vector of non-zero length", "leave that one out")
+    return points, vectors / length
+
+
+def _lift(scene: Scene, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Surface points moved off the surface, into the lattice."""
+    lattice = scene.lattice
+    u = np.asarray(lattice.to_voxel(points))
+    beyond = np.maximum(-u, u - np.asarray(lattice.shape)).max(-1, initial=-np.inf)
+    if len(points) and beyond.max() > _DEEP:
+        at = int(np.argmax(beyond))
+        expected = f"a point of the lattice, {_box(scene)}"
+        checks.fail(f"points[{at}]", points[at].tolist(), expected, "there are no surfaces outside it: leave it out")
+    advice = "pass points on a surface, or fluence(...) for points in space"
+    _check_depth(scene, "points", points, _DEEP, "on a surface", advice)
+    spacing = lattice.spacing
+    for _ in range(2 if len(points) and scene.solids else 1):
+        near = np.asarray(in_blocks(Scene.distance, scene, (points,)), np.float64) if len(points) else np.zeros(0)
+        points = points + np.maximum(_OFF * spacing - near, 0.0)[:, None] * normals
+    margin = _OFF * spacing
+    return np.clip(points, lattice.lower + margin, lattice.upper - margin)
+
+
+def _box(scene: Scene) -> str:
+    return f"{scene.lattice.lower.tolist()} to {scene.lattice.upper.tolist()}"
+
+
+def _hemisphere(number: int) -> np.ndarray:
+    """Directions around +z, (number, 3), whose density is cos / pi: a sunflower's seeds on the disc, lifted to the sphere."""
+    i = np.arange(number)
+    squared = (i + 0.5) / number
+    angle = i * np.pi * (3 - np.sqrt(5))
+    radius = np.sqrt(squared)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - squared)], -1)
+
+
+def _frames(normals: np.ndarray) -> np.ndarray:
+    """Three rows for each normal: two unit vectors across it, and itself. (n, 3, 3)."""
+    helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    first = np.cross(helper, normals)
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    return np.stack([first, np.cross(normals, first), normals], axis=1)

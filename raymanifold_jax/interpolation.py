@@ -1,0 +1,141 @@
+"""Irradiance between the surface elements.
+
+Each element e carries its irradiance E_e and a slope g_e along the surface, fitted to its neighbours by least squares.
+At a surface point x with normal n,
+
+    E(x) = sum_e w_e (E_e + g_e . (x - x_e)) / sum_e w_e,      w_e = max(0, n . n_e)^4 product_i max(0, 1 - |x - x_e|_i)
+
+over the elements in the 3 x 3 x 3 voxels around x, lengths in voxels: linear irradiance comes out exactly wherever the
+fit sees it, at edges too, and no facet of a voxel shows. The result stays near the range of the values around it.
+
+Public: `ElementTable`, `element_table`, `slopes`, `interpolate_irradiance`.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from .scene import PERIODIC, Scene
+from .surfaces import Surfaces
+from .trace import in_blocks
+
+_BLOCK = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
+_RIDGE = 0.05  # voxels squared: slopes that less than this much spread supports fade
+_LEAST = 1e-6  # share of elements out of reach, or facing elsewhere: only they count where there are no others
+_BEYOND = 0.5  # of the range of the values around: as far as a result may leave it
+
+
+class ElementTable(eqx.Module):
+    """Which elements lie in which voxel.
+
+    `row` is flat over the lattice and one layer of ghosts; row 0 of `members` is empty, and -1 stands for no element.
+    """
+
+    row: Int[Array, " V"]
+    members: Int[Array, "rows width"]
+    position: Float[Array, "E 3"]  # voxel coordinates
+    normal: Float[Array, "E 3"]
+
+
+def element_table(scene: Scene, surfaces: Surfaces) -> ElementTable:
+    """The elements of solids and walls by voxel; those of open sides are left out."""
+    real = jnp.zeros(0).dtype
+    padded = np.asarray(scene.lattice.shape) + 2
+    kept = np.nonzero(~surfaces.open)[0]
+    cell = np.ravel_multi_index(tuple((surfaces.voxel[kept] + 1).T), tuple(padded))
+    order = np.argsort(cell, kind="stable")
+    cells, first, count = np.unique(cell[order], return_index=True, return_counts=True)
+    members = np.full((len(cells) + 1, max(count.max(initial=0), 1)), -1, np.int32)
+    rows = np.repeat(np.arange(len(cells)), count)
+    members[rows + 1, np.arange(len(order)) - first[rows]] = kept[order]
+    row = np.zeros(padded, np.int32)
+    row.flat[cells] = np.arange(1, len(cells) + 1)
+    for axis in range(3):
+        if scene.boundary.sides[2 * axis] is PERIODIC:
+            turned = np.moveaxis(row, axis, 0)
+            turned[0], turned[-1] = turned[-2].copy(), turned[1].copy()
+    position = (surfaces.position - scene.lattice.lower) / scene.lattice.spacing
+    if not len(surfaces):
+        position = np.zeros((1, 3))
+    normal = surfaces.normal if len(surfaces) else np.zeros((1, 3))
+    return ElementTable(
+        jnp.asarray(row.ravel()), jnp.asarray(members), jnp.asarray(position, real), jnp.asarray(normal, real)
+    )
+
+
+def slopes(scene: Scene, table: ElementTable, values: Float[Array, "E C"]) -> Float[Array, "E C 3"]:
+    """Slopes of `values` along the surface at each element, per voxel, from the neighbours within the 3 x 3 x 3 voxels."""
+    return in_blocks(_slopes, (scene, table, values), (table.position, table.normal))
+
+
+def _slopes(context, u: Array, normal: Array) -> Array:
+    scene, table, values = context
+    element, arm, facing = _neighbours(scene, table, u, normal)
+    weight = facing * jnp.maximum(1.0 - jnp.sum(arm**2, -1) / 5.0, 0.0)
+    total = jnp.maximum(weight.sum(1), 1e-20)
+    around = values[element]
+    mean = jnp.einsum("nk,nki->ni", weight, arm) / total[:, None]
+    level = jnp.einsum("nk,nkc->nc", weight, around) / total[:, None]
+    arm, around = arm - mean[:, None], around - level[:, None]
+    spread = jnp.einsum("nk,nki,nkj->nij", weight, arm, arm) / total[:, None, None]
+    moment = jnp.einsum("nk,nki,nkc->nic", weight, arm, around) / total[:, None, None]
+    # Across the surface nothing is known: no slope there.
+    return jnp.swapaxes(_solve(spread + _RIDGE * _square(normal) + 1e-2 * _RIDGE * jnp.eye(3), moment), 1, 2)
+
+
+def _square(normal: Array) -> Array:
+    return 100.0 * normal[:, :, None] * normal[:, None, :]
+
+
+def _solve(a: Array, b: Array) -> Array:
+    """a^-1 b for symmetric (n, 3, 3), by the adjugate: far quicker here than a general solver."""
+    r = [jnp.cross(a[:, 1], a[:, 2]), jnp.cross(a[:, 2], a[:, 0]), jnp.cross(a[:, 0], a[:, 1])]
+    determinant = jnp.sum(a[:, 0] * r[0], -1)
+    return jnp.stack(r, 1) @ b / determinant[:, None, None]
+
+
+def interpolate_irradiance(
+    scene: Scene,
+    table: ElementTable,
+    values: Float[Array, "E C"],
+    slope: Float[Array, "E C 3"],
+    u: Float[Array, "n 3"],
+    normal: Float[Array, "n 3"],
+) -> Float[Array, "n C"]:
+    """Irradiance at surface points in voxel coordinates (module docstring). 0 where no element is near."""
+    element, arm, facing = _neighbours(scene, table, u, normal)
+    squared = jnp.sum(arm**2, -1)
+    reach = jnp.prod(jnp.maximum(1.0 - jnp.abs(arm), 0.0), -1) + _LEAST / (0.1 + squared) ** 3
+    weight = facing * reach
+    weight = weight / jnp.maximum(weight.sum(1, keepdims=True), 1e-30)
+    near = values[element]
+    there = near - jnp.einsum("nkci,nki->nkc", slope[element], arm)
+    result = jnp.einsum("nk,nkc->nc", weight, there)
+    around = (facing > 0.1)[..., None] & (squared < 4.0)[..., None]
+    low = jnp.min(jnp.where(around, near, jnp.inf), 1)
+    high = jnp.max(jnp.where(around, near, -jnp.inf), 1)
+    margin = _BEYOND * (high - low)
+    result = jnp.where(high >= low, jnp.clip(result, low - margin, high + margin), result)
+    return jnp.maximum(result, 0.0)
+
+
+def _neighbours(scene: Scene, table: ElementTable, u: Array, normal: Array) -> tuple[Array, Array, Array]:
+    """Elements in the voxels around points: index (n, k), x_e - x (n, k, 3), and how much they face the same way."""
+    shape = np.asarray(scene.lattice.shape)
+    home = jnp.clip(jnp.floor(u).astype(jnp.int32), 0, shape - 1)
+    strides = np.array([(shape[1] + 2) * (shape[2] + 2), shape[2] + 2, 1])
+    cell = ((home + 1) @ strides)[:, None] + _BLOCK @ strides
+    member = table.members[table.row[cell]].reshape(len(u), -1)
+    element = jnp.maximum(member, 0)
+    arm = table.position[element] - u[:, None]
+    for axis in range(3):
+        if scene.boundary.sides[2 * axis] is PERIODIC:
+            n = shape[axis]
+            arm = arm.at[..., axis].add(-n * jnp.round(arm[..., axis] / n))
+    cosine = jnp.einsum("nki,ni->nk", table.normal[element], normal)
+    return element, arm, jnp.where(member >= 0, jnp.maximum(cosine, 0.0) ** 4 + _LEAST, 0.0)
