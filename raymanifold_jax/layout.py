@@ -23,7 +23,8 @@ from .scene import MIRROR, Scene
 from .surfaces import Surfaces
 
 AXES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # sweep axis, u, v
-_CHUNK = 16  # directions times bands in one step: fits a CPU's second-level cache
+_CHUNK = 1 << 18  # rays times bands in one step: a compromise between a CPU's caches and the cost of starting a step
+_WORD = 32
 
 
 class Unfolding(eqx.Module):
@@ -59,7 +60,7 @@ class Reads(eqx.Module):
 
     cell: Int[Array, " M"]  # voxel read, flat in its plane
     element: Int[Array, " M"]
-    plane: Float[Array, "4 M"]  # the element's plane: offset, then the normal along (axis, u, v); padding: 0
+    plane: tuple[Float[Array, " M"], ...]  # the element's plane: offset, then the normal along (axis, u, v); padding: 0
     home: Int[Array, "2 M"]  # the element's own voxel: its plane and its place in the plane
     first_tile: Int[Array, " K1"]
     tile: int = eqx.field(static=True)
@@ -87,7 +88,7 @@ class Layout(eqx.Module):
     share: Float[Array, " I"]  # its share of that voxel's exitance
     buried: Bool[Array, "X Y Z"]  # voxels wholly inside solids
     inflow_image: Int[Array, "X Y Z"]  # which mirror image an open ghost voxel belongs to; -1: not open
-    reads: tuple[AxisReads, AxisReads, AxisReads]
+    reads: tuple[AxisReads, ...]  # by sweep axis
 
     def padded_along(self, axis: int) -> tuple[int, int, int]:
         """The padded shape, sweep axis first."""
@@ -157,7 +158,7 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
         source_element=jnp.asarray(element, np.int32),
         share=jnp.asarray(area / np.maximum(total[flat], 1e-300), real),
         buried=jnp.asarray(blocked & ~ghost),
-        inflow_image=jnp.asarray(inflow.reshape(padded), np.int32),
+        inflow_image=jnp.asarray(inflow.reshape(tuple(padded)), np.int32),
         reads=tuple(
             AxisReads(_reads(axes, padded, rows, voxel, real), _reads(axes, padded, probes, probe[probing], real))
             for axes in AXES
@@ -226,7 +227,7 @@ def _reads(axes: tuple[int, int, int], padded: np.ndarray, rows: dict, voxel: np
     return Reads(
         cell=spread(flat(voxel), 0, np.int32),
         element=spread(rows["element"], 0, np.int32),
-        plane=spread(np.column_stack([rows["offset"], rows["normal"][:, [axis, u, v]]]), 0.0, real),
+        plane=tuple(spread(values, 0.0, real) for values in (rows["offset"], *rows["normal"].T[[axis, u, v]])),
         home=spread(np.column_stack([rows["voxel"][:, axis], flat(rows["voxel"])]), 0, np.int32),
         first_tile=jnp.asarray(first_tile, np.int32),
         tile=tile,
@@ -247,13 +248,13 @@ class Ordinates(eqx.Module):
     index: Int[Array, "G D"]
     sign: Int[Array, " G"]
     laps: Int[Array, " G"]
-    # Bit d of each hit or probe read: rays of direction d arrive at the element in its own voxel.
-    hit_bits: UInt32[Array, "G M"] | None = None
-    probe_bits: UInt32[Array, "G M2"] | None = None
+    # Bit d of each hit or probe read, in words of 32: rays of direction d arrive at the element in its own voxel.
+    hit_bits: UInt32[Array, "G words M"] | None = None
+    probe_bits: UInt32[Array, "G words M2"] | None = None
 
 
-def make_ordinates(quadrature: Quadrature, bands: int) -> tuple[Ordinates, Ordinates, Ordinates]:
-    """Sort directions by their dominant axis and sense, and chunk them."""
+def make_ordinates(quadrature: Quadrature, bands: int, plane_size: int) -> tuple[Ordinates, ...]:
+    """Sort directions by their dominant axis and sense, and chunk them to suit planes of `plane_size` voxels."""
     w = quadrature.directions
     dominant = np.argmax(np.abs(w), axis=1)
     groups = {
@@ -262,7 +263,7 @@ def make_ordinates(quadrature: Quadrature, bands: int) -> tuple[Ordinates, Ordin
         for sign in (1, -1)
     }
     largest = max(len(g) for g in groups.values())
-    wanted = min(32, max(4, _CHUNK // bands))
+    wanted = min(2 * _WORD, max(8, _CHUNK // (bands * plane_size)))
     size = -(-largest // -(-largest // wanted))
     return tuple(_axis_ordinates(quadrature, axis, groups, size) for axis in range(3))
 

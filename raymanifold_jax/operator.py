@@ -14,7 +14,6 @@ Public: `Light`, `Transport`, `make_transport`, `Materials`, `materials`.
 from __future__ import annotations
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -39,8 +38,9 @@ class Light(eqx.Module):
     voxels: Float[Array, "C nx ny nz"] | None = None
 
     def __add__(self, other: Light) -> Light:
-        both = self.voxels is not None and other.voxels is not None
-        voxels = self.voxels + other.voxels if both else other.voxels if self.voxels is None else self.voxels
+        voxels = other.voxels if self.voxels is None else self.voxels
+        if self.voxels is not None and other.voxels is not None:
+            voxels = self.voxels + other.voxels
         return Light(self.elements + other.elements, voxels)
 
     def largest(self) -> Float[Array, ""]:
@@ -99,7 +99,7 @@ class Transport(eqx.Module):
     """K without the albedos: a layout, the directions, the medium's extinction, and the sums of a uniform radiance of 1."""
 
     layout: Layout
-    ordinates: tuple[Ordinates, Ordinates, Ordinates]
+    ordinates: tuple[Ordinates, ...]
     extinction: Float[Array, "C X Y Z"] | None
     element_sums: Float[Array, " E"]
     voxel_sums: Float[Array, "nx ny nz"]
@@ -119,20 +119,21 @@ def _ratio(sums: Array, furnace: Array) -> Array:
 def _sweep(layout, ordinates, extinction, leaving: Light, inflow: Inflow | None, fluence: bool) -> Light:
     medium = None
     if extinction is not None:
-        source = jnp.zeros((extinction.shape[0], *layout.shape), extinction.dtype) if leaving.voxels is None else leaving.voxels
-        medium = SweptMedium(extinction, layout.to_padded(source))
+        dark = jnp.zeros((extinction.shape[0], *layout.shape), extinction.dtype)
+        medium = SweptMedium(extinction, layout.to_padded(dark if leaving.voxels is None else leaving.voxels))
     return Light(*sweep(layout, ordinates, leaving.elements, medium, inflow, fluence))
 
 
 @eqx.filter_jit
-def _furnace(layout: Layout, ordinates, extinction) -> tuple[tuple, Light]:
-    """Mark the hits, and sweep a uniform radiance of 1."""
+def _furnace(layout: Layout, ordinates, extinction) -> tuple[tuple, Array, Array]:
+    """Mark the hits, and sweep a uniform radiance of 1: the sums at elements and, outside solids, in voxels."""
     ordinates = mark_hits(layout, ordinates)
     first = None if extinction is None else extinction[:1]
     voxels = None if first is None else jnp.ones((1, *layout.shape), first.dtype)
     leaving = Light(jnp.ones((1, layout.elements), layout.plane.dtype), voxels)
     sums = _sweep(layout, ordinates, first, leaving, None, True)
-    return ordinates, Light(sums.elements[0], jnp.where(_solid(layout), 0.0, sums.voxels[0]))
+    assert sums.voxels is not None
+    return ordinates, sums.elements[0], jnp.where(_solid(layout), 0.0, sums.voxels[0])
 
 
 def _solid(layout: Layout) -> Array:
@@ -154,14 +155,15 @@ def make_transport(
     """
     if mirrored and layout.unfolding.axes:
         quadrature = quadrature.mirrored(layout.unfolding.axes)
-    ordinates = make_ordinates(quadrature, bands)
+    largest_plane = int(np.prod(sorted(layout.padded)[1:]))
+    ordinates = make_ordinates(quadrature, bands, largest_plane)
     padded = None if extinction is None else layout.to_padded(extinction)
     if 0 in layout.pad:
         ordinates, longest = eqx.filter_jit(count_laps)(layout, ordinates, padded, _MOST_LAPS)
-        if not isinstance(longest, jax.core.Tracer) and int(longest) >= _MOST_LAPS:
+        if int(longest) >= _MOST_LAPS:
             raise ValueError(
                 f"boundary: some rays are still going after {_MOST_LAPS} laps of a periodic axis; expected every ray to meet "
                 "a surface, an open side or an absorbing medium; close or open another side, or add absorption"
             )
-    ordinates, sums = _furnace(layout, ordinates, padded)
-    return Transport(layout, ordinates, padded, sums.elements, sums.voxels)
+    ordinates, element_sums, voxel_sums = _furnace(layout, ordinates, padded)
+    return Transport(layout, ordinates, padded, element_sums, voxel_sums)

@@ -32,8 +32,9 @@ class SurfaceTable(NamedTuple):
 class Energy(NamedTuple):
     """Where the power goes, in W (all bands together).
 
-    `emitted` by surfaces, medium and point lights plus `entering` through open sides from sky and suns should equal `absorbed_by_surfaces` plus
-    `absorbed_by_medium` plus `leaving` through open sides. `imbalance` is the difference over the power put in.
+    `emitted` by surfaces, medium and point lights plus `entering` through open sides from sky and suns should equal
+    `absorbed_by_surfaces` plus `absorbed_by_medium` plus `leaving` through open sides. `imbalance` is the difference over
+    the power put in.
     """
 
     emitted: Float[jax.Array, ""]
@@ -108,12 +109,9 @@ class Solution(eqx.Module):
         irradiance = (self.diffuse_irradiance + self.sun_irradiance)[:, kept]
         radiosity = self.albedo[:, kept] * irradiance + jnp.pi * self.emission[:, kept]
         real = irradiance.dtype
-        geometry = (self.elements.position, self.elements.normal, self.elements.area)
         return SurfaceTable(
-            *(jnp.asarray(a[kept], real) for a in geometry),
-            self._banded(self.albedo[:, kept]),
-            self._banded(irradiance),
-            self._banded(radiosity),
+            *(jnp.asarray(a[kept], real) for a in (self.elements.position, self.elements.normal, self.elements.area)),
+            *(self._banded(a) for a in (self.albedo[:, kept], irradiance, radiosity)),
         )
 
     @property
@@ -125,10 +123,10 @@ class Solution(eqx.Module):
         if not np.isfinite(bound):
             ending = "no error bound: some light bounces without loss; lower an albedo below 1, or open a side"
         elif self.stagnated:
-            ending = f"stagnated at the float type's rounding; raise rtol, or enable float64 (bound {bound:.3g}, target {target:.3g})"
+            ending = "stagnated at the float type's rounding; raise rtol, or enable float64"
         else:
-            ending = f"sweep limit reached; raise max_sweeps or rtol (bound {bound:.3g}, target {target:.3g})"
-        return f"not converged after {count} sweeps: {ending}"
+            ending = "sweep limit reached; raise max_sweeps or rtol"
+        return f"not converged after {count} sweeps (bound {bound:.3g}, target {target:.3g}): {ending}"
 
     def _banded(self, values: Float[jax.Array, "C *shape"]) -> Float[jax.Array, "*shape C"]:
         return jnp.moveaxis(values, 0, -1) if self.scene.banded else values[0]

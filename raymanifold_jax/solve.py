@@ -1,14 +1,14 @@
 """Solving for the light everywhere: x = K x + b by Jacobi iteration, stopped on a certified bound.
 
-x holds what surfaces reflect and the medium scatters (see `operator`), b the part of it that comes straight from sources, so the
-k-th iterate holds light of up to k bounces (Langer, Breton & Zucker 1995, eq. 1). K has no negative entries. For any w > 0 with
-w - K w > 0, an iterate whose residual is r is at most
+x holds what surfaces reflect and the medium scatters (see `operator`), b the part of it straight from sources, so the
+k-th iterate holds light of up to k bounces (Langer, Breton & Zucker 1995, eq. 1). K has no negative entries. For any w > 0
+with w - K w > 0, an iterate whose residual is r is at most
 
     |x* - x| <= max |r| * max w / min(w - K w)
 
-from the exact solution x* of the discrete problem. w = 1 serves while every row of K adds up to less than 1; else w = 1 + K 1 +
-K^2 1 + ..., until every path of light has had a chance to end. The last change is no such bound: at albedo 0.99 it can be 100 times
-smaller than the error.
+from the exact solution x* of the discrete problem. w = 1 serves while every row of K adds up to less than 1; else
+w = 1 + K 1 + K^2 1 + ..., until every path of light has had a chance to end. The last change is no such bound: at albedo 0.99
+it can be 100 times smaller than the error.
 
 Public: `solve`, `Jacobi`.
 """
@@ -42,7 +42,7 @@ _STALLED = 24  # sweeps without progress before giving up
 
 
 class Jacobi(eqx.Module):
-    """The paper's iteration: one sweep a bounce. Converges for any scene that loses light; quickly where albedos are below 0.9."""
+    """The paper's iteration: one sweep a bounce. Converges where light is lost; quickly where albedos are below 0.9."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -174,8 +174,9 @@ def _iterate(system: _System, certificate: _Certificate, rtol: float, most: int,
     Each sweep carries the last order alone, x_(k+1) - x_k = K (x_k - x_(k-1)). That is Jacobi's iteration, but its rounding errors
     shrink with the orders.
     """
-    leaving = system.materials.reflected(system.source)
-    arriving = jax.tree.map(jnp.zeros_like, Light(system.source.elements, system.source.voxels if system.scatters else None))
+    source = system.source
+    leaving = system.materials.reflected(source)
+    arriving = jax.tree.map(jnp.zeros_like, Light(source.elements, source.voxels if system.scatters else None))
     lost = arriving
     # What sources send out straight away is part of the scale; it is all there is where nothing is reflected.
     scale = max(float(leaving.largest()), float(jnp.max(system.materials.emission, initial=0.0)))
@@ -194,7 +195,8 @@ def _iterate(system: _System, certificate: _Certificate, rtol: float, most: int,
 
 @eqx.filter_jit
 def _next_order(system: _System, total: Light, lost: Light, leaving: Light):
-    """One bounce more: the total of bounced light (Kahan's sum: `lost` holds its low bits), what leaves of this order, ..."""
+    """One bounce more: the total of bounced light (Kahan's sum: `lost` holds its low bits), what leaves of this order, the
+    largest of that, and the largest of all that leaves."""
     order = system.transport(leaving, fluence=system.scatters)
     addend = jax.tree.map(jnp.subtract, order, lost)
     after = total + addend
@@ -212,11 +214,12 @@ def _finish(scene, surfaces: Surfaces, quadrature, system: _System, certificate,
     rest = system.direct.rest + bounced
     outside = jnp.asarray(~surfaces.solid)
     free = jnp.where(outside, system.transport.voxel_sums / _whole(system.transport), 0.0)
+    fluence = lambda light: jnp.where(outside, 4 * jnp.pi * light.voxels, 0.0)
     fields = {
         "diffuse_irradiance": jnp.pi * rest.elements,
         "sun_irradiance": jnp.pi * system.direct.sun.elements,
-        "diffuse_fluence": jnp.where(outside, 4 * jnp.pi * rest.voxels, 0.0),
-        "sun_fluence": jnp.where(outside, 4 * jnp.pi * system.direct.sun.voxels, 0.0),
+        "diffuse_fluence": fluence(rest),
+        "sun_fluence": fluence(system.direct.sun),
     }
     bound = state.bound(certificate)
     return Solution(
@@ -230,7 +233,8 @@ def _finish(scene, surfaces: Surfaces, quadrature, system: _System, certificate,
 
 def _whole(transport: Transport) -> Float[Array, ""]:
     """The sum of weights that a wholly free voxel gets."""
-    return sum(jnp.sum(o.weight) for o in transport.ordinates) * len(transport.layout.unfolding.images())
+    weights = jnp.stack([jnp.sum(o.weight) for o in transport.ordinates])
+    return weights.sum() * len(transport.layout.unfolding.images())
 
 
 def _energy(scene: Scene, surfaces: Surfaces, quadrature, stuff: Materials, free, fields) -> Energy:

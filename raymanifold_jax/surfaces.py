@@ -75,20 +75,20 @@ def find_surfaces(scene: Scene) -> Surfaces:
         solid = (distance < 0) & ~cut
         parts += [p for side in range(6) if (p := _side_elements(scene, field, side)) is not None]
     if not parts:
-        parts = [_elements()]
+        parts = [_no_elements()]
     joined = {key: np.concatenate([p[key] for p in parts]) for key in parts[0]}
     return Surfaces(**joined, solid=solid)
 
 
-def _elements(
-    voxel=np.zeros((0, 3), int), normal=np.zeros((0, 3)), offset=np.zeros(0), area=np.zeros(0), position=np.zeros((0, 3)),
-    material=np.zeros(0, int), side=-1, open=False,
-) -> dict[str, np.ndarray]:  # fmt: skip
-    count = len(area)
-    return {
-        "voxel": voxel, "normal": normal, "offset": offset, "area": area, "position": position, "material": material,
-        "side": np.full(count, side), "open": np.full(count, open),
-    }  # fmt: skip
+def _elements(rows: dict[str, np.ndarray], side: int, is_open: bool) -> dict[str, np.ndarray]:
+    count = len(rows["area"])
+    return {**rows, "side": np.full(count, side), "open": np.full(count, is_open)}
+
+
+def _no_elements() -> dict[str, np.ndarray]:
+    rows = {"voxel": np.zeros((0, 3), int), "material": np.zeros(0, int)}
+    rows |= {key: np.zeros((0, 3)) for key in ("normal", "position")} | {key: np.zeros(0) for key in ("offset", "area")}
+    return _elements(rows, -1, False)
 
 
 class _DistanceField:
@@ -128,8 +128,8 @@ class _DistanceField:
             block = flat[start : start + size]
             padded = np.zeros((size, 3)) if len(block) < size else block
             padded[: len(block)] = block
-            parts.append(jax.tree.map(lambda a, n=len(block): np.asarray(a)[:n], function(jnp.asarray(padded))))
-        return jax.tree.map(lambda *a: np.concatenate(a).reshape(*shape, *a[0].shape[1:]), *parts)
+            parts.append(jax.tree.map(lambda a: np.asarray(a), function(jnp.asarray(padded))))
+        return jax.tree.map(lambda *a: np.concatenate(a)[: len(flat)].reshape(*shape, *a[0].shape[1:]), *parts)
 
 
 def _solid_elements(scene: Scene, field: _DistanceField, distance: np.ndarray) -> dict[str, np.ndarray]:
@@ -141,13 +141,13 @@ def _solid_elements(scene: Scene, field: _DistanceField, distance: np.ndarray) -
         for i in range(0, len(candidates), _BATCH)
     ]
     if not found:
-        return _elements()
+        return _no_elements()
     joined = {key: np.concatenate([f[key] for f in found]) for key in found[0]}
     center = lattice.lower + (joined["voxel"] + 0.5) * lattice.spacing
     position = center + joined.pop("centroid") * lattice.spacing
     material = field.nearest(position).astype(int)
     joined["area"] = joined["area"] * lattice.spacing**2
-    return _elements(position=position, material=material, **joined)
+    return _elements({**joined, "position": position, "material": material}, side=-1, is_open=False)
 
 
 def _faces(scene: Scene, field: _DistanceField, voxels: np.ndarray, distance: np.ndarray) -> dict[str, np.ndarray]:
@@ -318,12 +318,11 @@ def _side_elements(scene: Scene, field: _DistanceField, side: int) -> dict[str, 
             index = field.nearest(position - 0.01 * inward * lattice.spacing).astype(int)
         else:
             index = np.full(keep.sum(), material)
-        parts.append(
-            _elements(
-                voxel=voxel[keep], normal=np.tile(inward, (keep.sum(), 1)), offset=np.full(keep.sum(), -0.5),
-                area=fraction[keep] * lattice.spacing**2, position=position, material=index, side=side, open=is_open,
-            )
-        )  # fmt: skip
+        rows = {
+            "voxel": voxel[keep], "normal": np.tile(inward, (keep.sum(), 1)), "offset": np.full(keep.sum(), -0.5),
+            "area": fraction[keep] * lattice.spacing**2, "position": position, "material": index,
+        }  # fmt: skip
+        parts.append(_elements(rows, side, is_open))
     if not parts:
         return None
     return {key: np.concatenate([p[key] for p in parts]) for key in parts[0]}

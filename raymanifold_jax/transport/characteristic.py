@@ -21,6 +21,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt32
 
@@ -60,7 +61,7 @@ class Chords(NamedTuple):
 
 def sweep(
     layout: Layout,
-    ordinates: tuple[Ordinates, Ordinates, Ordinates],
+    ordinates: tuple[Ordinates, ...],
     exitance: Float[Array, "C E"],
     medium: SweptMedium | None = None,
     inflow: Inflow | None = None,
@@ -112,7 +113,7 @@ class _Track(NamedTuple):
     def plane(self, own: Ordinates, step: Int[Array, ""]) -> Int[Array, ""]:
         return jnp.where(own.sign > 0, step, self.count - 1 - step)
 
-    def table(self, own: Ordinates, first: Int[Array, ""] | int) -> _ChordTable:
+    def table(self, own: Ordinates, first: Int[Array, ""] | int) -> Chords:
         return _chord_table(own, first, self.count, self.width, self.wrap_v)
 
     def lap(self, own: Ordinates, first: Int[Array, ""] | int, rays: Float[Array, "D C P"]) -> Float[Array, "D C P"]:
@@ -120,8 +121,8 @@ class _Track(NamedTuple):
         table = self.table(own, first)
 
         def step(k, rays):
-            fields = self.fields.at(self.plane(own, k))
-            return _cross(rays, table.at(k), fields, self.length(own), None, self.width, self.wrap_v, False)[1]
+            fields = _row(self.fields, self.plane(own, k))
+            return _cross(rays, _row(table, k), fields, self.length(own), None, self.width, self.wrap_v, False)[1]
 
         return lax.fori_loop(0, self.count, step, rays)
 
@@ -159,12 +160,10 @@ def _sweep_axis(
 
         def plane_step(step, carry):
             rays, (hits, probes, mean) = carry
-            number, chords = track.plane(own, step), table.at(step)
-            plane = track.fields.at(number)
-            entering = None if images is None else _entering(images[number], radiance_in)
-            starts, rays, passing = _cross(
-                rays, chords, plane, length, entering, track.width, track.wrap_v, fluence
-            )  # fmt: skip
+            number, chords = track.plane(own, step), _row(table, step)
+            plane = _row(track.fields, number)
+            entering = None if images is None or radiance_in is None else _entering(_row(images, number), radiance_in)
+            starts, rays, passing = _cross(rays, chords, plane, length, entering, track.width, track.wrap_v, fluence)
             if passing is not None:
                 row = lax.dynamic_index_in_dim(mean, number, 0, keepdims=False)
                 row = row + jnp.tensordot(own.weight, passing, 1)
@@ -215,26 +214,14 @@ def count_laps(
     return tuple(counted), longest
 
 
-class _ChordTable(NamedTuple):
+def _chord_table(own: Ordinates, first: Int[Array, ""] | int, count: int, width: int, wrap_v: bool) -> Chords:
     """The chords of a chunk for all planes of a sweep: worked out once, because XLA would do it again for every voxel."""
-
-    reals: Float[Array, "K 21 D"]
-    offsets: Int[Array, "K 2 D"]
-
-    def at(self, step: Int[Array, ""]) -> Chords:
-        reals = lax.dynamic_index_in_dim(self.reals, step, 0, keepdims=False)
-        offsets = lax.dynamic_index_in_dim(self.offsets, step, 0, keepdims=False)
-        points = [tuple(reals[3 * i + j] for j in range(3)) for i in range(6)]
-        return Chords(tuple(zip(points[::2], points[1::2], strict=True)), tuple(reals[18:]), tuple(offsets))
+    return jax.vmap(lambda step: _chords(own, step, width, wrap_v))(first + jnp.arange(count))
 
 
-def _chord_table(own: Ordinates, first: Int[Array, ""] | int, count: int, width: int, wrap_v: bool) -> _ChordTable:
-    def one(step):
-        chords = _chords(own, step, width, wrap_v)
-        points = [x for ends in chords.ends for point in ends for x in point]
-        return jnp.stack([*points, *chords.share]), jnp.stack(chords.offsets)
-
-    return _ChordTable(*jax.vmap(one)(first + jnp.arange(count)))
+def _row(table, index: Int[Array, ""]):
+    """One row of each array."""
+    return jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, index, 0, keepdims=False), table)
 
 
 class _Fields(NamedTuple):
@@ -247,9 +234,6 @@ class _Fields(NamedTuple):
     exitance: Array
     extinction: Array | None
     source: Array | None
-
-    def at(self, plane: Int[Array, ""]) -> _Fields:
-        return jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, plane, 0, keepdims=False), self)
 
     def cells(self, cells: Int[Array, " T"]) -> _Fields:
         return jax.tree.map(lambda a: a[..., cells], self)
@@ -359,20 +343,26 @@ def _entering(image: Int[Array, " P"], radiance: Float[Array, "images D C"]) -> 
 def _read(sums, plane_number, reads: Reads, bits, own: Ordinates, starts, chords: Chords, plane: _Fields, length, mean_of):
     """Add weight * cosine * radiance for the elements that read voxels of this plane, in the directions of `bits`."""
     tile = reads.tile
-    number_of_bit = jnp.arange(own.weight.shape[0], dtype=jnp.uint32)[:, None]
+    word, bit = np.divmod(np.arange(own.weight.shape[0]), 32)
 
     def one(number, sums):
         start = number * tile
         cut = lambda a: lax.dynamic_slice_in_dim(a, start, tile, axis=-1)
-        cell, face = cut(reads.cell), cut(reads.plane)
+        cell, face = cut(reads.cell), tuple(cut(component) for component in reads.plane)
         radiance = [ray[:, :, cell] for ray in starts]
         value = mean_of(radiance, plane.cells(cell), face, chords, length[:, None, None])
-        chosen = ((cut(bits) >> number_of_bit) & 1).astype(value.dtype)
-        weight = own.weight[:, None] * jnp.maximum(-(own.direction @ face[1:]), 0.0) * chosen
+        chosen = ((cut(bits)[word] >> bit[:, None].astype(np.uint32)) & 1).astype(value.dtype)
+        weight = own.weight[:, None] * jnp.maximum(-_along(own.direction, face), 0.0) * chosen
         total = jnp.sum(weight[:, None] * value, axis=0)
         return lax.dynamic_update_slice_in_dim(sums, cut(sums) + total, start, axis=-1)
 
     return lax.fori_loop(reads.first_tile[plane_number], reads.first_tile[plane_number + 1], one, sums)
+
+
+def _along(direction: Float[Array, "D 3"], face: tuple) -> Float[Array, "D T"]:
+    """w . n of each direction and element."""
+    a, u, v = (direction[:, k, None] for k in range(3))
+    return a * face[1] + u * face[2] + v * face[3]
 
 
 def _mean_of_hits(radiance, plane: _Fields, face, chords: Chords, length) -> Float[Array, "D C T"]:
@@ -399,7 +389,7 @@ def _mean_of_paths(radiance, plane: _Fields, face, chords: Chords, length) -> Fl
     return jnp.where(paths > 1e-6, total / jnp.maximum(paths, 1e-6), 0.0)
 
 
-def _hit(face: Float[Array, "4 T"] | tuple, ends: tuple, share) -> tuple[Array, Array]:
+def _hit(face: tuple, ends: tuple, share) -> tuple[Array, Array]:
     """Whether rays arrive at the element's plane in a segment, and the share of the segment before it."""
     g0, g1 = _height(face, ends[0]), _height(face, ends[1])
     hit = (g0 >= -_BEHIND) & (g1 < 0) & (share > 0) & (g0 > g1)
@@ -415,7 +405,7 @@ def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinat
 
     def one_axis(axis: int, own: Ordinates, reads: AxisReads) -> Ordinates:
         if own.weight.shape[0] == 0:
-            hits, probes = (jnp.zeros((0, r.cell.shape[0]), jnp.uint32) for r in reads)
+            hits, probes = (jnp.zeros((0, 1, r.cell.shape[0]), jnp.uint32) for r in reads)
         else:
             hits, probes = (lax.map(lambda chunk, r=r: _hit_bits(layout, axis, chunk, r), own) for r in reads)
         empty = lambda x: x is None
@@ -424,22 +414,23 @@ def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinat
     return tuple(one_axis(a, o, r) for a, (o, r) in enumerate(zip(ordinates, layout.reads, strict=True)))
 
 
-def _hit_bits(layout: Layout, axis: int, chunk: Ordinates, reads: Reads) -> UInt32[Array, " M"]:
+def _hit_bits(layout: Layout, axis: int, chunk: Ordinates, reads: Reads) -> UInt32[Array, "words M"]:
     order = AXES[axis]
     count, height, width = layout.padded_along(axis)
     wrap_v = layout.pad[order[2]] == 0
     offsets = jnp.where(layout.buried, -1.0, layout.plane[0])
     geometry = [_planes(offsets, axis), *(_planes(layout.plane[1 + a], axis) for a in order)]
     rim = [jnp.arange(n) for n in (count, height, width)]
-    rim = [(r == 0) | (r == n - 1) if layout.pad[a] else r < 0 for r, n, a in zip(rim, layout.padded_along(axis), order, strict=True)]
+    rim = [(r == 0) | (r == r[-1]) if layout.pad[a] else r < 0 for r, a in zip(rim, order, strict=True)]
     ghost = (rim[0][:, None, None] | rim[1][:, None] | rim[2]).reshape(count, -1)
 
     def one(face, home):
         plane, cell = home
+        face = tuple(component[None] for component in face)
         chords = _chords(chunk, jnp.where(chunk.sign > 0, plane, count - 1 - plane), width, wrap_v)
         found, clean = False, True
         for number, ends in enumerate(chords.ends):
-            hit = _hit(face[:, None], ends, chords.share[number][:, None, None])[0][:, 0, 0]
+            hit = _hit(face, ends, chords.share[number][:, None, None])[0][:, 0, 0]
             offset = jnp.zeros_like(chords.offsets[0]) if number == 0 else chords.offsets[number - 1]
             along_v = jnp.where((jnp.abs(offset) == 1) & (width > 1), offset, 0)
             along_u = (offset - along_v) // width
@@ -447,13 +438,15 @@ def _hit_bits(layout: Layout, axis: int, chunk: Ordinates, reads: Reads) -> UInt
             step = chunk.sign if number == 0 else 0
             inside = [g[(plane - step) % count, before] for g in geometry]
             # The same point seen from the voxel before: one voxel further along the axis that is crossed.
-            back = (jnp.full_like(ends[0][0], step), along_u.astype(face.dtype), along_v.astype(face.dtype))
+            offset_type = ends[0][0].dtype
+            back = (jnp.full_like(ends[0][0], step), along_u.astype(offset_type), along_v.astype(offset_type))
             e = [x + y for x, y in zip(ends[0], back, strict=True)]
             above = inside[0] + inside[1] * e[0] + inside[2] * e[1] + inside[3] * e[2]
             # Ghost voxels emit at their faces: what leaves them for the lattice has not been inside a solid.
             emitted = ghost[(plane - step) % count, before] & ~ghost[plane, cell]
             found, clean = found | hit, clean & (~hit | (above > -1e-3) | emitted)
-        flags = (found & clean).astype(jnp.uint32)
-        return jnp.sum(flags << jnp.arange(flags.shape[0], dtype=jnp.uint32), dtype=jnp.uint32)
+        flags = jnp.asarray(found & clean).astype(jnp.uint32)
+        flags = jnp.pad(flags, (0, -flags.shape[0] % 32)).reshape(-1, 32)
+        return jnp.sum(flags << jnp.arange(32, dtype=jnp.uint32), axis=1, dtype=jnp.uint32)
 
-    return jax.vmap(one, in_axes=(1, 1))(reads.plane, reads.home)
+    return jax.vmap(one, in_axes=(0, 1), out_axes=1)(reads.plane, reads.home)
