@@ -32,8 +32,9 @@ _MODULE_OF = {
     "Sun": "scene",
     "Wall": "scene",
     "Characteristic": "transport.characteristic",
-    "Jacobi": "solve",
-    "Solution": "solve",
+    "Jacobi": "iteration",
+    "Krylov": "iteration",
+    "Solution": "solution",
     "solve": "solve",
     "fluence": "gather",
     "irradiance": "gather",
@@ -57,6 +58,8 @@ if TYPE_CHECKING:
     from raymanifold_jax.gather import irradiance as irradiance
     from raymanifold_jax.gather import outgoing_flux as outgoing_flux
     from raymanifold_jax.gather import radiance as radiance
+    from raymanifold_jax.iteration import Jacobi as Jacobi
+    from raymanifold_jax.iteration import Krylov as Krylov
     from raymanifold_jax.lattice import Lattice as Lattice
     from raymanifold_jax.render import render as render
     from raymanifold_jax.scene import MIRROR as MIRROR
@@ -76,8 +79,7 @@ if TYPE_CHECKING:
     from raymanifold_jax.shapes import Shape as Shape
     from raymanifold_jax.shapes import Sphere as Sphere
     from raymanifold_jax.shapes import Torus as Torus
-    from raymanifold_jax.solve import Jacobi as Jacobi
-    from raymanifold_jax.solve import Solution as Solution
+    from raymanifold_jax.solution import Solution as Solution
     from raymanifold_jax.solve import solve as solve
     from raymanifold_jax.transport.characteristic import Characteristic as Characteristic
 

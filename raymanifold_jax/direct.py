@@ -46,13 +46,20 @@ def first_flight(
 ) -> Direct:
     """All light that arrives straight from sources."""
     layout = transport.layout
-    swept = transport(Light(materials.emission, materials.medium_source), sky_inflow(scene, layout, quadrature))
+    dark = _dark(materials)
+    emits = jax.tree.map(jnp.any, Light(materials.emission, materials.medium_source))
+    sky = sky_inflow(scene, layout, quadrature)
+    if sky is None and not any(jax.tree.leaves(emits)):
+        nothing = jnp.zeros((scene.bands, *layout.shape), materials.emission.dtype)
+        swept = Light(dark.elements, nothing)
+    else:
+        swept = transport(Light(materials.emission, materials.medium_source), sky)
     if (points := small_emitters(scene, surfaces)) is not None:
         # The elements' share of the emitters' light is taken exactly; the sweep's share of it is taken out.
-        unlit = transport(Light(jnp.zeros_like(materials.emission), materials.medium_source),
-                          sky_inflow(scene, layout, quadrature), fluence=False)  # fmt: skip
         exact = emitter_irradiance(scene, points, surfaces.position, surfaces.normal) / jnp.pi
-        swept = Light(unlit.elements + exact, swept.voxels)
+        if sky is not None or bool(emits.voxels):
+            exact = exact + transport(Light(dark.elements, materials.medium_source), sky).elements
+        swept = Light(exact, swept.voxels)
     for light in scene.lights:
         if isinstance(light, PointLight):
             swept = swept + _from_point(scene, surfaces, light)
@@ -74,7 +81,7 @@ def sky_inflow(scene: Scene, layout: Layout, quadrature: Quadrature) -> Inflow |
     return Inflow(jnp.stack(images))
 
 
-def sky_radiance(scene: Scene, directions: Float[np.ndarray, "n 3"]) -> Float[Array, "C n"]:
+def sky_radiance(scene: Scene, directions: Float[Array, "n 3"] | Float[np.ndarray, "n 3"]) -> Float[Array, "C n"]:
     """Radiance of all skies along directions of travel."""
     total = jnp.zeros((scene.bands, len(directions)))
     for light in scene.lights:
@@ -82,6 +89,12 @@ def sky_radiance(scene: Scene, directions: Float[np.ndarray, "n 3"]) -> Float[Ar
             radiance = jnp.asarray(light.radiance_along(jnp.asarray(directions, total.dtype)))
             total = total + (radiance.T if radiance.ndim == 2 else radiance[None])
     return total
+
+
+def _dark(materials: Materials) -> Light:
+    """Nothing leaves anywhere."""
+    voxels = None if materials.extinction is None else jnp.zeros_like(materials.extinction)
+    return Light(jnp.zeros_like(materials.emission), voxels)
 
 
 def _from_sun(scene: Scene, surfaces: Surfaces, layout: Layout, sun: Sun, materials: Materials) -> Light:
@@ -96,13 +109,10 @@ def _from_sun(scene: Scene, surfaces: Surfaces, layout: Layout, sun: Sun, materi
     # Only the scene itself is lit; a mirror image of it gets what mirrors reflect.
     here = jnp.array([float(np.all(signs > 0)) for _, signs in images])
     radiance = here[:, None, None] * jnp.broadcast_to(irradiance, (len(images), count, scene.bands))
-    dark = Light(
-        jnp.zeros_like(materials.emission),
-        None if materials.extinction is None else jnp.zeros_like(materials.extinction),
-    )
-    mean = transport(dark, Inflow(radiance))
+    mean = transport(_dark(materials), Inflow(radiance))
+    assert mean.voxels is not None
     cosines = sum(np.maximum(-(surfaces.normal * signs) @ direction, 0) for _, signs in images)
-    return Light(mean.elements * jnp.asarray(cosines, radiance.dtype) / jnp.pi, mean.voxels * len(images) / (4 * jnp.pi))
+    return Light(mean.elements * jnp.asarray(cosines, radiance.dtype) / jnp.pi, mean.voxels * (len(images) / (4 * np.pi)))
 
 
 def _beam_transport(layout: Layout, beam: Quadrature, extinction, bands: int) -> Transport:

@@ -54,7 +54,7 @@ def element_table(scene: Scene, surfaces: Surfaces) -> ElementTable:
     rows = np.repeat(np.arange(len(cells)), count)
     members[rows + 1, np.arange(len(order)) - first[rows]] = kept[order]
     row = np.zeros(padded, np.int32)
-    row.flat[cells] = np.arange(1, len(cells) + 1)
+    row.reshape(-1)[cells] = np.arange(1, len(cells) + 1)
     for axis in range(3):
         if scene.boundary.sides[2 * axis] is PERIODIC:
             turned = np.moveaxis(row, axis, 0)

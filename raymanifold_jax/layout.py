@@ -11,6 +11,7 @@ Public: `Layout`, `make_layout`, `Ordinates`, `make_ordinates`.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -46,7 +47,8 @@ class Unfolding(eqx.Module):
         """Sum over the images: the transpose of `unfold`."""
         for axis in self.axes:
             parts = jnp.split(field, len(self.blocks[axis]), axis + 1)
-            field = sum(jnp.flip(p, axis + 1) if m else p for p, m in zip(parts, self.blocks[axis], strict=True))
+            turned = [jnp.flip(p, axis + 1) if m else p for p, m in zip(parts, self.blocks[axis], strict=True)]
+            field = jnp.stack(turned).sum(0)
         return field
 
     def images(self) -> list[tuple[tuple[int, ...], np.ndarray]]:
@@ -92,7 +94,8 @@ class Layout(eqx.Module):
 
     def padded_along(self, axis: int) -> tuple[int, int, int]:
         """The padded shape, sweep axis first."""
-        return tuple(self.padded[a] for a in AXES[axis])
+        order = AXES[axis]
+        return self.padded[order[0]], self.padded[order[1]], self.padded[order[2]]
 
     def to_padded(self, field: Float[Array, "C nx ny nz"]) -> Float[Array, "C X Y Z"]:
         """Unfold a field of the scene's lattice and give it ghost voxels (0)."""
@@ -115,22 +118,23 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
     sides = scene.boundary.sides
     unfolding = Unfolding(tuple(_blocks(sides[2 * a] is MIRROR, sides[2 * a + 1] is MIRROR) for a in range(3)))
     both_mirrors = [sides[2 * a] is MIRROR and sides[2 * a + 1] is MIRROR for a in range(3)]
-    pad = tuple(0 if scene.boundary.periodic[a] or both_mirrors[a] else 1 for a in range(3))
+    pad = _triple(0 if scene.boundary.periodic[a] or both_mirrors[a] else 1 for a in range(3))
     shape = np.array(lattice.shape)
-    padded = shape * [len(b) for b in unfolding.blocks] + 2 * np.array(pad)
+    padded = _triple(n * len(b) + 2 * p for n, b, p in zip(lattice.shape, unfolding.blocks, pad, strict=True))
 
     images = [_image(unfolding, number, signs, shape, pad, surfaces) for number, signs in unfolding.images()]
     voxel, probe, normal = (np.concatenate([image[key] for image in images]) for key in ("voxel", "probe", "normal"))
     element = np.tile(np.arange(len(surfaces)), len(images))
     image_number = np.repeat(np.arange(len(images)), len(surfaces))
     offset = surfaces.offset[element]
-    flat = np.ravel_multi_index(tuple(voxel.T), tuple(padded)) if len(voxel) else np.zeros(0, int)
+    flat = np.ravel_multi_index(tuple(voxel.T), padded) if len(voxel) else np.zeros(0, int)
     size = int(np.prod(padded))
 
     area = surfaces.area[element]
     total = np.bincount(flat, area, size)
     ghost = np.ones(padded, bool)
-    ghost[tuple(slice(p, n - p) for p, n in zip(pad, padded, strict=True))] = False
+    inner = tuple(slice(p, n - p) for p, n in zip(pad, padded, strict=True))
+    ghost[inner] = False
     plane = _voxel_planes(flat, offset, normal, area, total, padded, ghost)
     inflow = np.full(size, -1)
     is_open = surfaces.open[element]
@@ -141,7 +145,7 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
         constant_values=True,
     )
     periodic = [p == 0 for p in pad]
-    probe = np.where(periodic, probe % padded, np.clip(probe, 0, padded - 1))
+    probe = np.where(periodic, probe % padded, np.clip(probe, 0, np.array(padded) - 1))
     probing = ~blocked[tuple(probe.T)]
     rows = {"voxel": voxel, "element": element, "offset": offset, "normal": normal}
     probes = {key: value[probing] for key, value in rows.items()}
@@ -149,7 +153,7 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
     return Layout(
         unfolding=unfolding,
         shape=lattice.shape,
-        padded=tuple(int(n) for n in padded),
+        padded=padded,
         pad=pad,
         spacing=lattice.spacing,
         elements=len(surfaces),
@@ -158,12 +162,17 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
         source_element=jnp.asarray(element, np.int32),
         share=jnp.asarray(area / np.maximum(total[flat], 1e-300), real),
         buried=jnp.asarray(blocked & ~ghost),
-        inflow_image=jnp.asarray(inflow.reshape(tuple(padded)), np.int32),
+        inflow_image=jnp.asarray(inflow.reshape(padded), np.int32),
         reads=tuple(
             AxisReads(_reads(axes, padded, rows, voxel, real), _reads(axes, padded, probes, probe[probing], real))
             for axes in AXES
         ),
     )
+
+
+def _triple(values: Iterable[int]) -> tuple[int, int, int]:
+    a, b, c = values
+    return a, b, c
 
 
 def _blocks(lower: bool, upper: bool) -> tuple[bool, ...]:
@@ -202,7 +211,7 @@ def _voxel_planes(flat, offset, normal, area, total, padded, ghost) -> np.ndarra
     return plane
 
 
-def _reads(axes: tuple[int, int, int], padded: np.ndarray, rows: dict, voxel: np.ndarray, real) -> Reads:
+def _reads(axes: tuple[int, int, int], padded: tuple[int, int, int], rows: dict, voxel: np.ndarray, real) -> Reads:
     axis, u, v = axes
     planes = int(padded[axis])
     order = np.argsort(voxel[:, axis], kind="stable")

@@ -12,7 +12,7 @@ Public names: `estimate_memory`, `available_memory`, `check_memory`, `gigabytes`
 import os
 from pathlib import Path
 
-PROGRAM = 600_000_000  # Python, JAX, compilation, and the work arrays of a batch
+PROGRAM = 1_000_000_000  # Python, JAX, compilation, and the work arrays of a batch
 GEOMETRY = 20  # words a voxel: planes, the samples of the signed distance, copies turned to each axis
 FIELDS_VACUUM = 10  # words a voxel and band: sums of a sweep, fluence of sun, sky and bounces
 FIELDS_MEDIUM = 24  # the same, and coefficients, source, and the iteration's unknowns

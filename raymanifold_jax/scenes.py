@@ -77,7 +77,7 @@ def room(n: int = 64, black_light: bool = False) -> Scene:
     lattice = _unit_cube(n)
     checks.instance("black_light", black_light, bool, "pass True or False")
     wall = Wall(albedo=0.75)
-    # Behind the ceiling and flush with it: the ceiling's light-coloured part is this box's lower face.
+    # Behind the ceiling and flush with it: the part of it that shines is this box's lower face.
     light = Box((0.375, 0.375, 1), (0.625, 0.625, 1.125))
     return Scene(
         lattice,
@@ -142,16 +142,17 @@ def _parallel(
     center: Vector, direction: Vector, up: Vector, extent: tuple[float, float], resolution: Resolution
 ) -> OrthographicCamera:
     """A parallel projection with `extent` (across, up) in the picture."""
-    # The proportions are the camera's to check: it is made with some width first, so that it can.
+    # Made once with any width, because the camera checks the resolution.
     camera = OrthographicCamera(center, direction, up, width=extent[0], resolution=resolution)
     width = max(extent[0], extent[1] * camera.resolution[0] / camera.resolution[1])
     return OrthographicCamera(center, direction, up, width=width, resolution=resolution)
 
 
-def _top(lattice: Lattice, resolution: Resolution) -> OrthographicCamera:
+def _top(lattice: Lattice, resolution: Resolution, depth: float = 0.0) -> OrthographicCamera:
+    """The view down from `depth` below the upper side."""
     x, y, _ = (lattice.lower + lattice.upper) / 2
     across, upward, _ = lattice.extent
-    return _parallel((x, y, lattice.upper[2]), (0, 0, -1), (0, 1, 0), (across, upward), resolution)
+    return _parallel((x, y, lattice.upper[2] - depth), (0, 0, -1), (0, 1, 0), (across, upward), resolution)
 
 
 def _oblique(azimuth: float, elevation: float, lattice: Lattice, resolution: Resolution) -> OrthographicCamera:
@@ -207,7 +208,8 @@ SCENES: Mapping[str, SceneEntry] = MappingProxyType(
                 room,
                 "a closed room with a block, lit by a square in its ceiling",
                 64,
-                {"front": partial(_front, (0.5, -1.75, 0.5), (0.5, 0.5, 0.5), 34.0), "top": _top},
+                # From below the ceiling: on it, the eye would touch the light.
+                {"front": partial(_front, (0.5, -1.75, 0.5), (0.5, 0.5, 0.5), 34.0), "top": partial(_top, depth=1e-3)},
             ),
         )
     }

@@ -71,8 +71,8 @@ class Solution(eqx.Module):
     - `energy`: the power balance and its imbalance.
     - `error_bound`: certified: no radiosity, and no medium source times pi, is further than this from the exact solution of
       the discrete problem (in radiosity units; rounding apart). inf where no bound is known.
-    - `sweeps`: applications of the transport operator on the full lattice. `history`: the largest change in each sweep, in
-      radiosity units. `result`: how the iteration ended, in words; `converged`: whether it met the tolerance.
+    - `sweeps`: applications of the transport operator on the full lattice. `history`: the largest residual after each
+      sweep, in radiosity units. `result`: how the iteration ended, in words; `converged`: whether it met the tolerance.
     - `diffuse_*` and `sun_*`: (bands, ...), the light of the suns' direct beams, and all other light.
     """
 

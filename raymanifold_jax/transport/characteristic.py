@@ -190,7 +190,7 @@ def _sweep_axis(
 def count_laps(
     layout: Layout, ordinates: tuple[Ordinates, ...], extinction: Float[Array, "C X Y Z"] | None, most: int
 ) -> tuple[tuple[Ordinates, ...], Int[Array, ""]]:
-    """How often rays must go around each periodic axis until less than 1e-6 of their light is left; and the largest such count."""
+    """How often rays must go around each periodic axis until less than 1e-6 of their light is left; and the most of these."""
     bands = 1 if extinction is None else extinction.shape[0]
     dark = jnp.zeros((bands, *layout.padded), layout.plane.dtype)
     medium = None if extinction is None else SweptMedium(extinction, dark)

@@ -1,0 +1,464 @@
+"""The command line: `raymanifold render`, `solve`, `scenes`, `info`.
+
+Only click is imported here: everything heavy is loaded inside the commands, so that `--help` answers at once. All
+option values are checked before any work. Exit codes: 0; 1 where a solve did not converge (its pictures are written
+all the same) or the machine gave out; 2 for a value that cannot be used.
+
+Public name: `main`.
+"""
+
+import math
+import os
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from . import __version__
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from .scene import Scene
+    from .scenes import SceneEntry
+    from .solution import Solution
+
+_BRIGHT, _BRIGHT_SHARE = 0.9, 99.0  # auto exposure: this percentile of the radiance becomes this much of white
+_LARGEST_PICTURE = 16384  # pixels a side
+_FEWEST_DIRECTIONS = 24  # with fewer, the six faces of the sweep get no more than a few each
+_CACHED_FROM = 0.2  # seconds: programs that compile faster are not kept
+
+
+class _SceneName(click.ParamType):
+    name = "scene"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> "SceneEntry":
+        from .scenes import find
+
+        try:
+            return find(value)
+        except ValueError as error:
+            self.fail(str(error), param, ctx)
+
+
+class _Resolution(click.ParamType):
+    name = "resolution"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        parts = str(value).lower().split("x")
+        sides = [int(part) if part.isascii() and part.isdigit() and len(part) < 10 else 0 for part in parts]
+        if not (len(sides) in (1, 2) and all(1 <= side <= _LARGEST_PICTURE for side in sides)):
+            expected = f"expected pixels from 1 to {_LARGEST_PICTURE}"
+            self.fail(f"got {value!r}, {expected}; write 640x480, or 512 for a square", param, ctx)
+        return sides[0], sides[-1]
+
+
+class _Exposure(click.ParamType):
+    name = "exposure"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | None:
+        """Stops; None is auto."""
+        if str(value).lower() == "auto":
+            return None
+        try:
+            stops = float(value)
+        except ValueError:
+            stops = math.nan
+        if not abs(stops) <= 100:
+            self.fail(f"got {value!r}, expected stops from -100 to 100; write -1 to halve, or auto", param, ctx)
+        return stops
+
+
+def _checked(valid: Callable[[Any], bool], expected: str, advice: str) -> Callable[..., Any]:
+    """A click callback that refuses values which are not `valid`."""
+
+    def check(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
+        if value is not None and not valid(value):
+            raise click.BadParameter(f"got {value}, expected {expected}; {advice}", ctx, param)
+        return value
+
+    return check
+
+
+def _output(ctx: click.Context, param: click.Parameter, path: Path | None) -> Path | None:
+    if path is None:
+        return None
+    if path.suffix.lower() != ".exr":
+        got = f"got {str(path)!r}, expected a name that ends in .exr"
+        raise click.BadParameter(f"{got}; write {str(path) + '.exr'!r}, a .png appears beside it", ctx, param)
+    for target in (path, path.with_suffix(".png")):
+        _check_writable(target, ctx, param)
+    return path
+
+
+def _check_writable(path: Path, ctx: click.Context, param: click.Parameter | None = None) -> None:
+    folder, advice = path.parent, "make it first, or write elsewhere"
+    try:
+        if not folder.is_dir():
+            raise click.BadParameter(f"got {str(path)!r}, expected a directory that exists; {advice}", ctx, param)
+        if not os.access(folder, os.W_OK | os.X_OK):
+            advice = "choose another with --out"
+            raise click.BadParameter(f"got {str(path)!r}, expected a directory you may write in; {advice}", ctx, param)
+        if path.exists() and not path.is_file():
+            raise click.BadParameter(f"got {str(path)!r}, expected a file; something else has that name", ctx, param)
+    except OSError as error:  # a name too long, a directory that may not be entered
+        raise click.BadParameter(f"got {str(path)!r}: {error.strerror}; choose another name", ctx, param) from error
+
+
+_scene = click.argument("scene", type=_SceneName(), metavar="SCENE")
+_lattice_options = (
+    click.option(
+        "--size",
+        type=int,
+        metavar="N",
+        callback=_checked(lambda n: n >= 4, "a whole number >= 4", "64 is quick, 128 fine"),
+        help="Voxels a side. [default: the scene's own]",
+    ),
+    click.option(
+        "--directions",
+        type=int,
+        metavar="N",
+        default=200,
+        show_default=True,
+        callback=_checked(
+            lambda n: _FEWEST_DIRECTIONS <= n <= 1_000_000,
+            f"a whole number from {_FEWEST_DIRECTIONS} to 1000000",
+            "200 is often enough",
+        ),
+        help="Directions of the sweeps.",
+    ),
+)
+_solve_options = (
+    *_lattice_options,
+    click.option(
+        "--rtol",
+        type=float,
+        metavar="X",
+        default=1e-3,
+        show_default=True,
+        callback=_checked(lambda x: 0 < x < 1, "a number between 0 and 1", "1e-3 is fine for pictures"),
+        help="Certified error bound to reach, relative to the largest radiosity.",
+    ),
+    click.option(
+        "--max-sweeps",
+        type=int,
+        metavar="N",
+        default=1000,
+        show_default=True,
+        callback=_checked(lambda n: n >= 1, "a whole number >= 1", "leave it out for 1000"),
+        help="Stop there at the latest.",
+    ),
+    click.option("--quiet", is_flag=True, help="Print nothing but warnings and errors."),
+    click.option("--no-progress", is_flag=True, help="No progress bar."),
+)
+
+
+def _with(options: Sequence[Callable[..., Any]]) -> Callable[..., Any]:
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            function = option(function)
+        return function
+
+    return decorate
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="raymanifold")
+def main() -> None:
+    """Deterministic light transport on a voxel lattice: solve a scene, and take pictures of it.
+
+    Try: raymanifold render three-balls --out fog.exr
+    """
+
+
+@main.command()
+@_scene
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    callback=_output,
+    metavar="FILE.exr",
+    help="The OpenEXR file; a PNG appears beside it. [default: SCENE.exr]",
+)
+@click.option("--camera", metavar="NAME", help="The view: `raymanifold scenes` lists them. [default: the first]")
+@click.option("--all-views", is_flag=True, help="All of the scene's views, as FILE-VIEW.exr.")
+@click.option(
+    "--resolution", type=_Resolution(), default="512", metavar="WxH", show_default=True, help="Pixels: 640x480, or 512."
+)
+@click.option(
+    "--samples",
+    type=int,
+    metavar="N",
+    default=4,
+    show_default=True,
+    callback=_checked(
+        lambda n: 1 <= n <= 1024 and math.isqrt(n) ** 2 == n, "a square number from 1 to 1024", "4 or 16 are good"
+    ),
+    help="Rays a pixel: 1, 4, 9, ...",
+)
+@click.option(
+    "--exposure",
+    type=_Exposure(),
+    metavar="STOPS",
+    default="auto",
+    show_default=True,
+    help=f"Of the PNG: stops, or auto, which takes the {_BRIGHT_SHARE:g}th percentile to {_BRIGHT} of white (linear).",
+)
+@click.option("--half", is_flag=True, help="Store 16-bit floats.")
+@_with(_solve_options)
+@click.pass_context
+def render(
+    ctx: click.Context,
+    scene: "SceneEntry",
+    out: Path | None,
+    camera: str | None,
+    all_views: bool,
+    resolution: tuple[int, int],
+    samples: int,
+    exposure: float | None,
+    half: bool,
+    **settings: Any,
+) -> None:
+    """Solve SCENE (ring, three-balls or room) and write pictures of it."""
+    if camera is not None and all_views:
+        raise click.UsageError("--camera and --all-views exclude each other; leave one out", ctx)
+    if camera is not None and camera not in scene.views:
+        got = f"--camera: got {camera!r}, expected one of {', '.join(scene.views)}"
+        raise click.UsageError(f"{got}; leave it out for {next(iter(scene.views))!r}", ctx)
+    out = Path(f"{scene.name}.exr") if out is None else out
+    wanted = list(scene.views) if all_views else [camera or next(iter(scene.views))]
+    files = {view: out.with_stem(f"{out.stem}-{view}") if all_views else out for view in wanted}
+    for file in files.values():
+        for target in (file, file.with_suffix(".png")):
+            _check_writable(target, ctx)
+    size = settings["size"] or scene.default_size
+    with _one_line_errors():
+        built = _build(scene, size, settings["directions"])
+        from .scenes import cameras
+
+        views = cameras(scene.name, built, resolution)
+        solution, seconds = _solve(built, **settings)
+
+        import raymanifold_jax as rm
+
+        began = time.perf_counter()
+        pictures = {view: rm.render(solution, views[view], samples=samples) for view in files}
+        render_seconds = time.perf_counter() - began
+        # One exposure for all views, so that they can be compared.
+        stops = _auto_exposure(pictures.values()) if exposure is None else exposure
+        for view, file in files.items():
+            header = {"camera": view, "samples": samples, "exposure": stops}
+            header |= _header(scene, size, solution, settings["directions"], settings["rtol"])
+            attributes = {f"raymanifold.{key}": value for key, value in header.items()}
+            rm.io.write_exr(file, pictures[view], attributes=attributes, half=half)
+            rm.io.write_png(file.with_suffix(".png"), pictures[view], exposure=stops)
+    if not settings["quiet"]:
+        _report(scene, solution, {"solve": seconds, "render": render_seconds})
+        kind = "auto" if exposure is None else "given"
+        _line("exposure", f"{stops:+.2f} stops ({kind})")
+        for file in files.values():
+            _line("wrote", f"{file}, {file.with_suffix('.png')}")
+    _warn_unless_converged(ctx, solution)
+
+
+@main.command()
+@_scene
+@_with(_solve_options)
+@click.pass_context
+def solve(ctx: click.Context, scene: "SceneEntry", **settings: Any) -> None:
+    """Solve SCENE (ring, three-balls or room) and print where its light goes."""
+    with _one_line_errors():
+        built = _build(scene, settings["size"] or scene.default_size, settings["directions"])
+        solution, seconds = _solve(built, **settings)
+    if not settings["quiet"]:
+        _report(scene, solution, {"solve": seconds})
+        click.echo("energy, W")
+        for name, value in solution.energy._asdict().items():
+            _line(f"  {name.replace('_', ' ')}", f"{float(value):.6g}")
+    _warn_unless_converged(ctx, solution)
+
+
+@main.command()
+def scenes() -> None:
+    """List the scenes, their views and default sizes."""
+    from .scenes import SCENES
+
+    for entry in SCENES.values():
+        click.echo(f"{entry.name}\n    {entry.description}")
+        click.echo(f"    views: {', '.join(entry.views)}; default size {entry.default_size}")
+
+
+@main.command()
+@click.argument("scene", type=_SceneName(), metavar="[SCENE]", required=False)
+@_with(_lattice_options)
+def info(scene: "SceneEntry | None", size: int | None, directions: int) -> None:
+    """Versions, devices, and the memory that SCENE (or every scene) needs against what there is."""
+    cache = _use_cache()
+    from importlib.metadata import version
+
+    import jax
+
+    from .memory import available_memory, estimate_memory, gigabytes
+    from .scenes import SCENES
+
+    _line("raymanifold-jax", __version__)
+    _line("python", sys.version.split()[0])
+    for package in ("jax", "jaxlib", "equinox", "numpy", "OpenEXR"):
+        _line(package, version(package))
+    _line("devices", ", ".join(str(device) for device in jax.devices()))
+    _line("compiled programs", cache or "not kept")
+    available = available_memory()
+    _line("memory available", "unknown" if available is None else gigabytes(available))
+    for entry in SCENES.values() if scene is None else [scene]:
+        with _one_line_errors():
+            built = entry.build(size or entry.default_size)
+        shape = built.lattice.shape
+        need = estimate_memory(shape, built.bands, directions, built.medium is not None)
+        fits = "" if available is None or need <= available else ": more than there is"
+        _line(f"{entry.name} needs", f"{gigabytes(need)} at {' x '.join(map(str, shape))}{fits}")
+
+
+def _build(entry: "SceneEntry", size: int, directions: int) -> "Scene":
+    """The scene, if its solve fits into memory."""
+    _use_cache()
+    from .memory import check_memory
+
+    scene = entry.build(size)
+    check_memory(scene.lattice.shape, scene.bands, directions, scene.medium is not None)
+    return scene
+
+
+def _solve(
+    scene: "Scene", directions: int, rtol: float, max_sweeps: int, quiet: bool, no_progress: bool, **_: Any
+) -> tuple["Solution", float]:
+    """The solution, and the seconds it took."""
+    import jax
+
+    import raymanifold_jax as rm
+
+    began = time.perf_counter()
+    solution = rm.solve(
+        scene,
+        quadrature=rm.quadrature.fibonacci(directions),
+        rtol=rtol,
+        max_sweeps=max_sweeps,
+        progress=not (quiet or no_progress),
+    )
+    jax.block_until_ready(solution.diffuse_fluence)
+    return solution, time.perf_counter() - began
+
+
+def _header(entry: "SceneEntry", size: int, solution: "Solution", directions: int, rtol: float) -> dict[str, Any]:
+    return {
+        "version": __version__,
+        "scene": entry.name,
+        "size": size,
+        "directions": directions,
+        "rtol": rtol,
+        "sweeps": solution.sweeps,
+        "error_bound": float(solution.error_bound),
+        "imbalance": float(solution.energy.imbalance),
+        "result": solution.result,
+    }
+
+
+def _auto_exposure(pictures: "Iterable[np.ndarray]") -> float:
+    """Stops that take the brightest per cent of all pixels to `_BRIGHT` or more; 0 for black pictures."""
+    import numpy as np
+
+    bright = float(np.percentile(np.concatenate([picture.ravel() for picture in pictures]), _BRIGHT_SHARE))
+    return min(max(math.log2(_BRIGHT / bright), -100.0), 100.0) if bright > 0 else 0.0
+
+
+def _report(entry: "SceneEntry", solution: "Solution", seconds: Mapping[str, float]) -> None:
+    from .memory import gigabytes
+
+    _line(entry.name, solution.scene.summary())
+    _line("sweeps", str(solution.sweeps))
+    _line("certified bound", f"{solution.error_bound:.3g} W m^-2 (target {solution.target:.3g})")
+    _line("energy imbalance", f"{100 * float(solution.energy.imbalance):+.3f} %")
+    for name, value in seconds.items():
+        _line(name, f"{value:.1f} s")
+    peak = _peak_memory()
+    if peak is not None:
+        _line("peak memory", gigabytes(peak))
+
+
+def _peak_memory() -> int | None:
+    """Bytes this process has held at most; None where the system does not say."""
+    try:
+        import resource
+    except ImportError:  # Windows
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def _line(name: str, value: str) -> None:
+    click.echo(f"{name:<24} {value}")
+
+
+def _warn_unless_converged(ctx: click.Context, solution: "Solution") -> None:
+    if not solution.converged:
+        click.secho(f"Warning: {solution.result}", err=True, fg="red", bold=True)
+        ctx.exit(1)
+
+
+def _failure(error: BaseException, exit_code: int) -> click.ClickException:
+    failure = click.ClickException(" ".join(str(error).split()) or type(error).__name__)
+    vars(failure)["exit_code"] = exit_code  # a class variable by its declaration
+    return failure
+
+
+@contextmanager
+def _one_line_errors() -> Iterator[None]:
+    """What the library refuses, and what the machine cannot do, in one line."""
+    try:
+        yield
+    except ValueError as error:
+        raise _failure(error, 2) from error
+    except (MemoryError, OSError) as error:
+        raise _failure(error, 1) from error
+    except RuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):  # XLA's word for out of memory
+            raise
+        raise _failure(error, 1) from error
+
+
+def _cache_directory(environment: Mapping[str, str]) -> str | None:
+    """Where compiled programs are kept; None for nowhere.
+
+    `RAYMANIFOLD_CACHE`, which may be empty for nowhere, or else JAX's own setting, or else the user's cache directory.
+    """
+    for variable in ("RAYMANIFOLD_CACHE", "JAX_COMPILATION_CACHE_DIR"):
+        if variable in environment:
+            return environment[variable] or None
+    user = environment.get("XDG_CACHE_HOME", "")
+    # A relative path has no meaning there (XDG base directory specification).
+    base = Path(user) if os.path.isabs(user) else Path("~/.cache").expanduser()
+    return str(base / "raymanifold")
+
+
+def _use_cache() -> str | None:
+    """Have JAX keep compiled programs; the directory, or None."""
+    directory = _cache_directory(os.environ)
+    if directory is not None:
+        try:
+            os.makedirs(directory, exist_ok=True)
+        except OSError as error:
+            click.echo(f"Warning: no cache of compiled programs in {directory!r}: {error.strerror}", err=True)
+            directory = None
+    import jax
+
+    jax.config.update("jax_compilation_cache_dir", directory)
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", _CACHED_FROM)
+    return directory
+
+
+if __name__ == "__main__":
+    main(prog_name="raymanifold")
