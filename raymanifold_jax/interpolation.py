@@ -47,7 +47,7 @@ def element_table(scene: Scene, surfaces: Surfaces) -> ElementTable:
     real = jnp.zeros(0).dtype
     padded = np.asarray(scene.lattice.shape) + 2
     kept = np.nonzero(~surfaces.open)[0]
-    cell = np.ravel_multi_index(tuple((surfaces.voxel[kept] + 1).T), tuple(padded))
+    cell = np.asarray(np.ravel_multi_index(tuple((surfaces.voxel[kept] + 1).T), tuple(padded)))
     order = np.argsort(cell, kind="stable")
     cells, first, count = np.unique(cell[order], return_index=True, return_counts=True)
     members = np.full((len(cells) + 1, max(count.max(initial=0), 1)), -1, np.int32)

@@ -127,7 +127,7 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
     element = np.tile(np.arange(len(surfaces)), len(images))
     image_number = np.repeat(np.arange(len(images)), len(surfaces))
     offset = surfaces.offset[element]
-    flat = np.ravel_multi_index(tuple(voxel.T), padded) if len(voxel) else np.zeros(0, int)
+    flat = np.asarray(np.ravel_multi_index(tuple(voxel.T), padded)) if len(voxel) else np.zeros(0, int)
     size = int(np.prod(padded))
 
     area = surfaces.area[element]
