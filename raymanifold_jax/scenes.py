@@ -200,7 +200,7 @@ SCENES: Mapping[str, SceneEntry] = MappingProxyType(
                 "three-balls",
                 three_balls_in_fog,
                 "three balls in an open box full of fog, under the sun (figure 5)",
-                128,
+                96,
                 {"front": partial(_front, (0.5, -1.9, 0.95), (0.5, 0.5, 0.47), 34.0), "top": _top},
             ),
             SceneEntry(

@@ -19,6 +19,7 @@ from . import checks
 from .direct import first_flight, sky_radiance
 from .iteration import Iteration, Jacobi, Krylov, System, certify
 from .layout import make_layout
+from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
 from .progress import Progress, make_progress
 from .quadrature import Quadrature, fibonacci
@@ -58,6 +59,7 @@ def solve(
     """
     _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh)
     quadrature = fibonacci(_DEFAULT_DIRECTIONS) if quadrature is None else quadrature
+    check_memory(scene.lattice.shape, scene.bands, len(quadrature), scene.medium is not None)
     meter = make_progress(progress)
     with meter:
         meter.start(f"solve {scene.summary()}")

@@ -55,8 +55,8 @@ def furnace(cavity: str, albedo: float, medium: rm.Medium | None = None, n: int 
 
         B = 1 / (1 - rho)
 
-    everywhere, as is pi times the radiance, whatever medium of scattering albedo 1 fills it (`closed_enclosures.csv`). In voxels
-    the expected fluence is 4 B. `cavity`: "box", "ball" (a box with a ball in it) or "sphere".
+    everywhere, as is pi times the radiance, whatever medium of scattering albedo 1 fills it (`closed_enclosures.csv`). In
+    voxels the expected fluence is 4 B. `cavity`: "box", "ball" (a box with a ball in it) or "sphere".
     """
     shapes = {"box": [], "ball": [BALL], "sphere": [SPHERICAL_CAVITY]}[cavity]
     solids = [rm.Solid(shape, albedo, UNIT_EXITANCE) for shape in shapes]
@@ -120,11 +120,10 @@ def ball_under_half_sky(n: int = 24) -> Problem:
 
         E = pi (1 + n_z) / 2
 
-    (the sky's view factor from a tilted plane: Liu & Jordan, Solar Energy 4, 1960). The expected value is a function of normals.
+    (the sky's view factor from a tilted plane: Liu & Jordan, Solar Energy 4, 1960). The expected value is a function of
+    normals.
     """
-    scene = rm.Scene(
-        cube(n), [rm.Solid(rm.Sphere((0.5, 0.5, 0.5), 1 / 3), 0.0)], lights=[rm.Sky(1.0, hemisphere=(0, 0, 1))]
-    )
+    scene = rm.Scene(cube(n), [rm.Solid(rm.Sphere((0.5, 0.5, 0.5), 1 / 3), 0.0)], lights=[rm.Sky(1.0, hemisphere=(0, 0, 1))])
     return Problem(scene, lambda normals: np.pi * (1 + normals[:, 2]) / 2)
 
 

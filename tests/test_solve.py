@@ -1,0 +1,110 @@
+"""The iteration: its certified bound, its energy balance, what it says when it stops, and that solutions are well-formed."""
+
+import numpy as np
+import problems
+import pytest
+
+import raymanifold_jax as rm
+
+DIRECTIONS = rm.quadrature.fibonacci(60)
+
+
+def random_scene(seed: int) -> rm.Scene:
+    """A ball in a box with random albedos up to 0.95, emissions, half a sky, and for odd seeds a medium."""
+    random = np.random.default_rng(seed)
+    uniform = lambda low, high: float(random.uniform(low, high))
+    wall = lambda: rm.Wall(uniform(0, 0.95), uniform(0, 1) * random.integers(2))
+    medium = rm.Medium(random.uniform(0, 3, (8, 8, 8)), random.uniform(0, 0.3, (8, 8, 8)), uniform(0, 0.2))
+    return rm.Scene(
+        problems.cube(8),
+        [rm.Solid(problems.BALL, uniform(0.5, 0.95), uniform(0, 1))],
+        medium if seed % 2 else None,
+        [rm.Sky(uniform(0, 2), hemisphere=random.normal(size=3))],
+        rm.Boundary((wall(), wall()), (wall(), wall()), (wall(), rm.OPEN if random.integers(2) else wall())),
+    )
+
+
+@pytest.mark.parametrize("solver", [rm.Jacobi(), rm.Krylov(), rm.Krylov(restart=2)], ids=repr)
+@pytest.mark.parametrize("seed", range(6))
+def test_error_bound_holds(seed, solver):
+    # A loose solve is no further from a tight one than it certifies, in radiosity and in the medium's source times pi. The
+    # tight solve's own error, 1e-5 of the largest radiosity, is allowed for.
+    scene = random_scene(seed)
+    loose = rm.solve(scene, DIRECTIONS, rtol=1e-2, solver=solver, progress=False)
+    tight = rm.solve(scene, DIRECTIONS, rtol=1e-5, solver=rm.Jacobi(), progress=False)
+    assert loose.converged and tight.converged and loose.sweeps <= tight.sweeps
+    assert loose.error_bound <= loose.target and tight.error_bound <= tight.target
+    error = np.abs(np.asarray(loose.surfaces.radiosity) - np.asarray(tight.surfaces.radiosity)).max()
+    allowed = loose.error_bound + tight.error_bound + 1e-6 * float(tight.surfaces.radiosity.max())
+    assert error <= allowed
+    if scene.medium is not None:
+        albedo = np.asarray(scene.medium.scattering / scene.medium.extinction[..., 0])
+        difference = np.abs(np.asarray(loose.fluence) - np.asarray(tight.fluence))
+        assert (albedo * difference / 4).max() <= allowed
+
+
+def test_error_bound_of_an_albedo_close_to_one_comes_from_paths_that_end():
+    # Largest albedo 1: the simple bound, residual / (1 - albedo), is infinite. Light still ends on the other walls.
+    scene = rm.Scene(
+        problems.cube(8),
+        [rm.Solid(problems.BALL, 1.0)],
+        boundary=rm.Boundary(rm.Wall(0.5, 1.0), rm.Wall(0.3), rm.Wall(0.3)),
+    )
+    loose, tight = (rm.solve(scene, DIRECTIONS, rtol=rtol, progress=False) for rtol in (1e-2, 1e-5))
+    assert loose.converged and np.isfinite(loose.error_bound)
+    error = np.abs(np.asarray(loose.surfaces.radiosity) - np.asarray(tight.surfaces.radiosity)).max()
+    assert error <= loose.error_bound + tight.error_bound
+
+
+def test_sweep_limit_is_told_and_can_raise():
+    scene = problems.furnace("ball", 0.95).scene
+    solution = rm.solve(scene, DIRECTIONS, max_sweeps=2, progress=False)
+    assert not solution.converged and len(solution.history) == 2
+    assert solution.error_bound > solution.target
+    assert "max_sweeps" in solution.result and "rtol" in solution.result and "not converged" in solution.result
+    assert solution.result in repr(solution)
+    with pytest.raises(RuntimeError, match="raise max_sweeps or rtol"):
+        rm.solve(scene, DIRECTIONS, max_sweeps=2, throw=True, progress=False)
+
+
+def test_light_that_never_ends_has_no_bound():
+    # A closed cavity of albedo 1 that emits has no solution: no bound, and the text says what to change.
+    scene = rm.Scene(problems.cube(8), [rm.Solid(problems.BALL, 1.0, 1.0)], boundary=problems.walls(1.0))
+    solution = rm.solve(scene, DIRECTIONS, max_sweeps=3, progress=False)
+    assert not solution.converged and solution.error_bound == np.inf
+    assert "below 1" in solution.result
+
+
+def test_solution_is_well_formed():
+    scene = random_scene(1)
+    solution = rm.solve(scene, DIRECTIONS, solver=rm.Jacobi(), progress=False)
+    surfaces, elements = solution.surfaces, solution.elements
+    kept = ~elements.open
+    count = int(kept.sum())
+    assert surfaces.positions.shape == surfaces.normals.shape == (count, 3)
+    for column in (surfaces.areas, surfaces.albedo, surfaces.irradiance, surfaces.radiosity):
+        assert column.shape == (count,) and column.dtype == np.float32
+    emission = np.asarray(solution.emission)[0, kept]
+    np.testing.assert_allclose(
+        surfaces.radiosity, np.asarray(surfaces.albedo * surfaces.irradiance) + np.pi * emission, rtol=1e-6
+    )
+    assert solution.fluence.shape == scene.lattice.shape
+    assert (np.asarray(solution.fluence) >= 0).all() and (np.asarray(surfaces.irradiance) >= 0).all()
+    # Orders of bounced light shrink by at least the largest row sum, so Jacobi's history falls.
+    assert (np.diff(solution.history) < 0).all()
+    assert "converged" in solution.result and str(solution.sweeps) in solution.result
+
+
+def test_energy_balance_counts_each_way_in_and_out():
+    # A black box: what the walls emit, pi L A, they absorb; nothing leaves. Exactly known, but for the gather's share.
+    black = rm.solve(
+        rm.Scene(problems.cube(8), [rm.Solid(problems.BALL, 0.0)], boundary=problems.walls(0.0, 1.0)),
+        DIRECTIONS,
+        progress=False,
+    )
+    assert float(black.energy.emitted) == pytest.approx(6 * np.pi, rel=1e-5)
+    assert float(black.energy.entering) == float(black.energy.leaving) == float(black.energy.absorbed_by_medium) == 0
+    # A uniform sky sends pi A through each open side.
+    lone = rm.solve(problems.lone_ball(0.5).scene, DIRECTIONS, progress=False)
+    assert float(lone.energy.entering) == pytest.approx(6 * np.pi, rel=1e-5)
+    assert abs(float(lone.energy.imbalance)) < 0.02
