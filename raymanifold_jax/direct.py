@@ -21,11 +21,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .layout import Layout
+from .march import transmittance
 from .operator import Light, Materials, Transport, make_transport
 from .quadrature import Quadrature
 from .scene import PointLight, Scene, Sky, Sun
 from .surfaces import Surfaces, patch_points
-from .trace import transmittance, visible
+from .trace import visible
 from .transport.characteristic import Inflow
 
 _SUN_OFFSETS = 4  # rays a voxel, a side

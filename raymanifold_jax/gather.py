@@ -24,9 +24,11 @@ from jaxtyping import Array, Float
 from . import checks
 from .direct import emitter_irradiance, sky_radiance, small_emitters
 from .interpolation import ElementTable, element_table, interpolate_irradiance, slopes
+from .march import fill, interpolate, march_between, transmittance, transmittance_between
 from .scene import MIRROR, OPEN, PERIODIC, PointLight, Scene, Sun, Wall
 from .solution import Solution
-from .trace import Hit, _first_hit, _march, _passed, _sloped, _to_voxel, fill, in_blocks, interpolate, transmittance, visible
+from .trace import Hit, trace_rays, visible
+from .unfolding import in_blocks, sloped, to_voxel
 
 _OFF = 2e-3  # voxels: how far off a surface rays start
 _DEEP = 0.5  # voxels: how far inside a solid a point on its surface may be by mistake
@@ -53,8 +55,10 @@ def radiance(solution: Solution, origins: Any, directions: Any) -> Float[Array, 
     Directions may have any length but 0. Walls are seen from inside only: an eye outside the lattice looks through those
     in front of it.
 
-    **Raises** `ValueError` for NaN, another shape, a direction of length 0, or an origin inside a solid.
+    **Raises** `TypeError` for anything but a solution, `ValueError` for NaN, another shape, a direction of length 0, or an
+    origin inside a solid.
     """
+    _check_solution(solution)
     origins, directions = _rays(origins, directions, "origins", "directions")
     check_outside(solution.scene, "origins", origins)
     return _banded(solution.scene, in_blocks(radiance_along, light_field(solution), (origins, directions)))
@@ -67,8 +71,10 @@ def irradiance(solution: Solution, points: Any, normals: Any, directions: int = 
     of suns, point lights and small emitting surfaces exactly. The normals may have any length but 0. Points up to half
     a voxel inside a solid or outside the lattice are taken to be on the surface.
 
-    **Raises** `ValueError` for NaN, another shape, a normal of length 0, or points further inside.
+    **Raises** `TypeError` for anything but a solution, `ValueError` for NaN, another shape, a normal of length 0, or points
+    further inside.
     """
+    _check_solution(solution)
     points, normals = _rays(points, normals, "points", "normals")
     number = checks.positive_int("directions", directions)
     scene, spacing = solution.scene, solution.scene.lattice.spacing
@@ -97,8 +103,10 @@ def irradiance(solution: Solution, points: Any, normals: Any, directions: int = 
 def fluence(solution: Solution, points: Any) -> Float[Array, "n *bands"]:
     """Fluence at points (n, 3) of the space that solids leave free, in W m^-2: interpolated, with the suns' exactly.
 
-    **Raises** `ValueError` for NaN, another shape, or points outside the lattice or inside a solid.
+    **Raises** `TypeError` for anything but a solution, `ValueError` for NaN, another shape, or points outside the lattice or
+    inside a solid.
     """
+    _check_solution(solution)
     points, scene = checks.points("points", points), solution.scene
     if isinstance(points, np.ndarray):
         outside = ~np.asarray(scene.lattice.contains(points))
@@ -118,6 +126,7 @@ def outgoing_flux(solution: Solution, side: str) -> Float[Array, "nu nv *bands"]
 
     **Raises** `ValueError` for another name or a side that is not OPEN.
     """
+    _check_solution(solution)
     if side not in _SIDES:
         checks.fail("side", repr(side), f"one of {', '.join(_SIDES)}", 'the upper side of z is "z+"')
     number, scene, elements = _SIDES.index(side), solution.scene, solution.elements
@@ -144,7 +153,6 @@ def light_field(solution: Solution) -> LightField:
     known = _fields.get(id(solution))
     if known is not None and known[0]() is solution:
         return known[1]
-    checks.instance("solution", solution, Solution, "pass what rm.solve(scene) returns")
     field = _light_field(solution)
     if not checks.is_traced(solution):
         key = id(solution)
@@ -175,7 +183,7 @@ def _light_field(solution: Solution) -> LightField:
 def surface_radiance(field: LightField, hit: Hit) -> Float[Array, "n C"]:
     """Radiance that leaves the surfaces at hits, in every direction; 0 where there is none."""
     scene = field.scene
-    u = _to_voxel(scene, hit.point)
+    u = to_voxel(scene, hit.point)
     arriving = interpolate_irradiance(scene, field.table, field.irradiance, field.slope, u, hit.normal)
     arriving = arriving + _sun_irradiance(scene, hit.point + _OFF * scene.lattice.spacing * hit.normal, hit.normal)
     material = jnp.maximum(hit.material, 0)
@@ -186,17 +194,17 @@ def surface_radiance(field: LightField, hit: Hit) -> Float[Array, "n C"]:
 def radiance_along(field: LightField, origins: Array, directions: Array) -> Float[Array, "n C"]:
     """`radiance` for one block of rays with directions of length 1."""
     scene = field.scene
-    hit = _first_hit(scene, origins, directions)
+    hit = trace_rays(scene, origins, directions)
     behind = jnp.where((hit.material >= 0)[:, None], surface_radiance(field, hit), sky_radiance(scene, -hit.direction).T)
     if scene.medium is None:
         return behind
-    added, passed = _march((scene, field.fluence), origins, directions, hit.enter, hit.distance)
+    added, passed = march_between((scene, field.fluence), origins, directions, hit.enter, hit.distance)
     return added + passed * behind
 
 
 def _fluence_at(field: LightField, points: Array) -> Float[Array, "n C"]:
     scene = field.scene
-    return interpolate(scene, field.diffuse, _to_voxel(scene, points)) + _sun_light(scene, points, None)
+    return interpolate(scene, field.diffuse, to_voxel(scene, points)) + _sun_light(scene, points, None)
 
 
 def _sun_irradiance(scene: Scene, points: Array, normals: Array) -> Float[Array, "n C"]:
@@ -230,14 +238,14 @@ def _sun_light(scene: Scene, points: Array, normals: Array | None) -> Float[Arra
 
 def _sunlit(scene: Scene, points: Array, back: Array, towards: Array) -> Float[Array, "n C"]:
     """Transmittance to the sun, 0 in shadow: the ray back must leave through an open side, straight towards it."""
-    hit = _first_hit(scene, points, back)
+    hit = trace_rays(scene, points, back)
     lit = (hit.material < 0) & (jnp.abs(hit.direction - towards).max(-1) < 1e-6)
     if scene.medium is None:
         return jnp.broadcast_to(lit[:, None], (len(points), scene.bands)).astype(points.dtype)
     spacing = scene.lattice.spacing
     reach = jnp.where(lit, hit.distance, 0.0) / spacing
     enter = jnp.where(lit, hit.enter, 0.0) / spacing
-    passed = _passed(scene, _to_voxel(scene, points), _sloped(back), enter, jnp.maximum(reach, enter))
+    passed = transmittance_between(scene, to_voxel(scene, points), sloped(back), enter, jnp.maximum(reach, enter))
     return jnp.where(lit[:, None], passed, 0.0)
 
 
@@ -260,6 +268,10 @@ def _banded(scene: Scene, values: Float[Array, "n C"]) -> Float[Array, "n *bands
 
 
 # Points, directions and what can be wrong with them
+
+
+def _check_solution(solution: Any) -> None:
+    checks.instance("solution", solution, Solution, "pass what rm.solve(scene) returns")
 
 
 def check_outside(scene: Scene, name: str, points: Any) -> None:

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 
 from .scene import PERIODIC, Scene
 from .surfaces import Surfaces
-from .trace import in_blocks
+from .unfolding import in_blocks
 
 _BLOCK = np.array(list(itertools.product((-1, 0, 1), repeat=3)))
 _RIDGE = 0.05  # voxels squared: slopes that less than this much spread supports fade

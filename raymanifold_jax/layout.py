@@ -92,6 +92,11 @@ class Layout(eqx.Module):
     inflow_image: Int[Array, "X Y Z"]  # which mirror image an open ghost voxel belongs to; -1: not open
     reads: tuple[AxisReads, ...]  # by sweep axis
 
+    @property
+    def cubic(self) -> bool:
+        """Whether the sweeps along the three axes are alike, and can share one program."""
+        return len(set(self.padded)) == 1 and len(set(self.pad)) == 1
+
     def padded_along(self, axis: int) -> tuple[int, int, int]:
         """The padded shape, sweep axis first."""
         order = AXES[axis]
@@ -164,8 +169,8 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
         buried=jnp.asarray(blocked & ~ghost),
         inflow_image=jnp.asarray(inflow.reshape(padded), np.int32),
         reads=tuple(
-            AxisReads(_reads(axes, padded, rows, voxel, real), _reads(axes, padded, probes, probe[probing], real))
-            for axes in AXES
+            AxisReads(hits, other)
+            for hits, other in zip(_reads(padded, rows, voxel, real), _reads(padded, probes, probe[probing], real), strict=True)
         ),
     )
 
@@ -211,33 +216,38 @@ def _voxel_planes(flat, offset, normal, area, total, padded, ghost) -> np.ndarra
     return plane
 
 
-def _reads(axes: tuple[int, int, int], padded: tuple[int, int, int], rows: dict, voxel: np.ndarray, real) -> Reads:
-    axis, u, v = axes
-    planes = int(padded[axis])
-    order = np.argsort(voxel[:, axis], kind="stable")
-    count = np.bincount(voxel[:, axis], minlength=planes)
-    typical = np.median(count[count > 0]) if len(order) else 1
+def _reads(padded: tuple[int, int, int], rows: dict, voxel: np.ndarray, real) -> list[Reads]:
+    """The reads of `voxel` by the elements in `rows`, for each sweep axis; all axes get arrays of the same length."""
+    counts = [np.bincount(voxel[:, axis], minlength=padded[axis]) for axis in range(3)]
+    occupied = np.concatenate(counts)
+    typical = np.median(occupied[occupied > 0]) if len(voxel) else 1
     tile = int(np.clip(2 ** np.ceil(np.log2(max(typical, 1))), 64, 1024))
-    tiles = -(-count // tile)
-    first_tile = np.concatenate([[0], np.cumsum(tiles)])
-    total = max(int(first_tile[-1]), 1) * tile
+    total = max(1, *(int((-(-count // tile)).sum()) for count in counts)) * tile
+    return [_axis_reads(axes, padded[axes[2]], counts[axes[0]], tile, total, rows, voxel, real) for axes in AXES]
+
+
+def _axis_reads(
+    axes: tuple[int, int, int], width: int, count: np.ndarray, tile: int, total: int, rows: dict, voxel: np.ndarray, real
+) -> Reads:
+    axis, u, v = axes
+    order = np.argsort(voxel[:, axis], kind="stable")
+    first_tile = np.concatenate([[0], np.cumsum(-(-count // tile))])
     # Row of each read: its plane's first tile, then its rank in the plane.
     sorted_plane = voxel[order, axis]
     rank = np.arange(len(order)) - np.concatenate([[0], np.cumsum(count)])[sorted_plane]
     row = first_tile[sorted_plane] * tile + rank
+    flat = lambda where: where[:, u] * width + where[:, v]
 
-    flat = lambda where: where[:, u] * padded[v] + where[:, v]
-
-    def spread(values, fill, dtype):
-        out = np.full((*values.shape[1:], total), fill, dtype)
+    def spread(values, dtype):
+        out = np.zeros((*values.shape[1:], total), dtype)
         out[..., row] = np.moveaxis(values[order], 0, -1)
         return jnp.asarray(out)
 
     return Reads(
-        cell=spread(flat(voxel), 0, np.int32),
-        element=spread(rows["element"], 0, np.int32),
-        plane=tuple(spread(values, 0.0, real) for values in (rows["offset"], *rows["normal"].T[[axis, u, v]])),
-        home=spread(np.column_stack([rows["voxel"][:, axis], flat(rows["voxel"])]), 0, np.int32),
+        cell=spread(flat(voxel), np.int32),
+        element=spread(rows["element"], np.int32),
+        plane=tuple(spread(values, real) for values in (rows["offset"], *rows["normal"].T[[axis, u, v]])),
+        home=spread(np.column_stack([rows["voxel"][:, axis], flat(rows["voxel"])]), np.int32),
         first_tile=jnp.asarray(first_tile, np.int32),
         tile=tile,
     )
@@ -257,6 +267,7 @@ class Ordinates(eqx.Module):
     index: Int[Array, "G D"]
     sign: Int[Array, " G"]
     laps: Int[Array, " G"]
+    chunks: Int[Array, ""]  # how many of the G are in use
     # Bit d of each hit or probe read, in words of 32: rays of direction d arrive at the element in its own voxel.
     hit_bits: UInt32[Array, "G words M"] | None = None
     probe_bits: UInt32[Array, "G words M2"] | None = None
@@ -274,18 +285,20 @@ def make_ordinates(quadrature: Quadrature, bands: int, plane_size: int) -> tuple
     largest = max(len(g) for g in groups.values())
     wanted = min(2 * _WORD, max(8, _CHUNK // (bands * plane_size)))
     size = -(-largest // -(-largest // wanted))
-    return tuple(_axis_ordinates(quadrature, axis, groups, size) for axis in range(3))
+    counts = [sum(-(-len(groups[axis, sign]) // size) for sign in (1, -1)) for axis in range(3)]
+    return tuple(_axis_ordinates(quadrature, axis, groups, size, max(counts)) for axis in range(3))
 
 
-def _axis_ordinates(quadrature: Quadrature, axis: int, groups: dict, size: int) -> Ordinates:
+def _axis_ordinates(quadrature: Quadrature, axis: int, groups: dict, size: int, count: int) -> Ordinates:
     order = list(AXES[axis])
     chunks = [(sign, g[i : i + size]) for sign in (1, -1) for g in [groups[axis, sign]] for i in range(0, len(g), size)]
-    count = len(chunks)
     direction = np.zeros((count, size, 3))
+    direction[..., 0] = 1
+    signs = np.ones(count, np.int32)
     weight, index = np.zeros((count, size)), np.zeros((count, size), int)
     slope, start = np.zeros((count, size, 2)), np.full((count, size, 2), 0.5)
     for row, (sign, members) in enumerate(chunks):
-        direction[row, :, 0] = sign
+        direction[row, :, 0] = signs[row] = sign
         n = len(members)
         direction[row, :n] = quadrature.directions[members][:, order]
         weight[row, :n], index[row, :n] = quadrature.weights[members], members
@@ -299,5 +312,5 @@ def _axis_ordinates(quadrature: Quadrature, axis: int, groups: dict, size: int) 
     return Ordinates(
         direction=jnp.asarray(direction, real), weight=jnp.asarray(weight, real), slope=jnp.asarray(slope, real),
         start=jnp.asarray(start, real), index=jnp.asarray(index, np.int32),
-        sign=jnp.asarray([c[0] for c in chunks], np.int32).reshape(count), laps=jnp.ones(count, np.int32),
+        sign=jnp.asarray(signs), laps=jnp.ones(count, np.int32), chunks=jnp.asarray(len(chunks), np.int32),
     )  # fmt: skip

@@ -16,7 +16,7 @@ from . import checks
 from .camera import AbstractCamera, PerspectiveCamera
 from .gather import check_outside, light_field, radiance_along
 from .solution import Solution
-from .trace import in_blocks
+from .unfolding import in_blocks
 
 _RAYS = 1 << 18  # at once
 

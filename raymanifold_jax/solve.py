@@ -1,7 +1,7 @@
 """Solving a scene for the light everywhere.
 
-The scene becomes surface elements and a layout for the sweeps; light straight from the sources is worked out once; bounced light
-is iterated to a certified bound (see `iteration`).
+The scene becomes surface elements and a layout for the sweeps; light straight from the sources is worked out once; bounced
+light is iterated to a certified bound (see `iteration`).
 
 Public: `solve`.
 """

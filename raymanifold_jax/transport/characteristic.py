@@ -16,7 +16,8 @@ Public: `Characteristic`, `sweep`, `SweptMedium`, `Inflow`, `mark_hits`, `count_
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -75,19 +76,38 @@ def sweep(
     """
     bands = exitance.shape[0]
     surface = layout.exitance_field(exitance)
-    at_elements = jnp.zeros((bands, layout.elements), exitance.dtype)
-    in_voxels = jnp.zeros((bands, *layout.padded), exitance.dtype) if fluence else None
-    for axis, (axes, own, reads) in enumerate(zip(AXES, ordinates, layout.reads, strict=True)):
-        if own.weight.shape[0] == 0:
-            continue
-        hits, probes, passing = _sweep_axis(layout, axis, own, reads, surface, medium, inflow, fluence)
+
+    def one_axis(axis, own: Ordinates, reads: AxisReads, sums):
+        at_elements, in_voxels = sums
+        fields, images = _on_axis(axis, lambda a: _fields(layout, a, surface, medium, inflow is not None))
+        track = _track(layout, axis if isinstance(axis, int) else 0, fields)
+        hits, probes, passing = _sweep_axis(track, own, reads, images, inflow, fluence)
         at_elements = at_elements.at[:, reads.hits.element].add(hits).at[:, reads.probes.element].add(probes)
-        if in_voxels is not None and passing is not None:
-            shape = tuple(layout.padded[a] for a in axes)
-            back = tuple(axes.index(a) for a in range(3))
-            field = jnp.moveaxis(passing, 1, 0).reshape(bands, *shape)
-            in_voxels = in_voxels + field.transpose(0, *(1 + b for b in back))
+        if passing is not None:
+            in_voxels = in_voxels + _on_axis(axis, lambda a: _from_planes(layout, a, passing))
+        return at_elements, in_voxels
+
+    sums = (
+        jnp.zeros((bands, layout.elements), exitance.dtype),
+        jnp.zeros((bands, *layout.padded), exitance.dtype) if fluence else None,
+    )
+    if layout.cubic:  # one program for the three axes: less to compile
+        directions = jax.tree.map(lambda *a: jnp.stack(a), *ordinates)
+        reads = jax.tree.map(lambda *a: jnp.stack(a), *layout.reads)
+        one = lambda axis, sums: one_axis(axis, _row(directions, axis), _row(reads, axis), sums)
+        sums = lax.fori_loop(0, 3, one, sums)
+    else:
+        for axis in range(3):
+            sums = one_axis(axis, ordinates[axis], layout.reads[axis], sums)
+    at_elements, in_voxels = sums
     return at_elements, None if in_voxels is None else layout.from_padded(in_voxels)
+
+
+def _on_axis(axis: int | Array, function: Callable[[int], Any]) -> Any:
+    """`function` of a sweep axis that is known now, or only when the program runs."""
+    if isinstance(axis, int):
+        return function(axis)
+    return lax.switch(axis, [lambda a=a: function(a) for a in range(3)])
 
 
 def _planes(field: Float[Array, "*C X Y Z"], axis: int) -> Float[Array, "K *C P"]:
@@ -104,6 +124,7 @@ class _Track(NamedTuple):
     count: int  # planes
     area: int  # voxels a plane
     width: int
+    periodic: bool
     wrap_v: bool
     spacing: float
 
@@ -127,34 +148,41 @@ class _Track(NamedTuple):
         return lax.fori_loop(0, self.count, step, rays)
 
 
-def _track(layout: Layout, axis: int, surface: Float[Array, "C X Y Z"], medium: SweptMedium | None) -> _Track:
-    order = AXES[axis]
+def _fields(layout: Layout, axis: int, surface: Float[Array, "C X Y Z"], medium: SweptMedium | None, inflow: bool):
+    """Everything on planes along a sweep axis: the fields, and with `inflow` the image numbers of open ghost voxels."""
     fields = _Fields(
-        geometry=tuple(_planes(layout.plane[row], axis) for row in (0, *(1 + a for a in order))),
+        geometry=tuple(_planes(layout.plane[row], axis) for row in (0, *(1 + a for a in AXES[axis]))),
         exitance=_planes(surface, axis),
         extinction=None if medium is None else _planes(medium.extinction, axis),
         source=None if medium is None else _planes(medium.source, axis),
     )
+    return fields, _planes(layout.inflow_image, axis) if inflow else None
+
+
+def _from_planes(layout: Layout, axis: int, planes: Float[Array, "K C P"]) -> Float[Array, "C X Y Z"]:
+    """The inverse of `_planes`."""
+    field = jnp.moveaxis(planes, 1, 0).reshape(-1, *layout.padded_along(axis))
+    return field.transpose(0, *(1 + AXES[axis].index(a) for a in range(3)))
+
+
+def _track(layout: Layout, axis: int, fields: _Fields) -> _Track:
     count, height, width = layout.padded_along(axis)
-    return _Track(fields, count, height * width, width, layout.pad[order[2]] == 0, layout.spacing)
+    periodic, wrap_v = layout.pad[axis] == 0, layout.pad[AXES[axis][2]] == 0
+    return _Track(fields, count, height * width, width, periodic, wrap_v, layout.spacing)
 
 
 def _sweep_axis(
-    layout: Layout,
-    axis: int,
+    track: _Track,
     ordinates: Ordinates,
     reads: AxisReads,
-    surface: Float[Array, "C X Y Z"],
-    medium: SweptMedium | None,
+    images: Int[Array, "K P"] | None,
     inflow: Inflow | None,
     fluence: bool,
 ) -> tuple[Float[Array, "C M"], Float[Array, "C M2"], Float[Array, "K C P"] | None]:
-    bands, real = surface.shape[0], surface.dtype
-    track = _track(layout, axis, surface, medium)
-    images = _planes(layout.inflow_image, axis) if inflow is not None else None
+    bands, real = track.fields.exitance.shape[1], track.fields.exitance.dtype
 
     def chunk_step(chunk, totals):
-        own = jax.tree.map(lambda a: a[chunk], ordinates)
+        own = _chunk(ordinates, chunk)
         radiance_in = None if inflow is None else inflow.radiance[:, own.index]
         table, length = track.table(own, 0), track.length(own)
 
@@ -169,12 +197,13 @@ def _sweep_axis(
                 row = row + jnp.tensordot(own.weight, passing, 1)
                 mean = lax.dynamic_update_index_in_dim(mean, row, number, 0)
             here = (own, starts, chords, plane, length)
+            assert own.hit_bits is not None and own.probe_bits is not None  # by mark_hits
             hits = _read(hits, number, reads.hits, own.hit_bits, *here, _mean_of_hits)
             probes = _read(probes, number, reads.probes, ~own.probe_bits, *here, _mean_of_paths)
             return rays, (hits, probes, mean)
 
         rays = jnp.zeros((own.weight.shape[0], bands, track.area), real)
-        if layout.pad[axis] == 0:  # enough laps that what entered at the first no longer matters
+        if track.periodic:  # enough laps that what entered at the first no longer matters
             first = lambda number: (number - own.laps + 1) * track.count
             rays = lax.fori_loop(0, own.laps - 1, lambda number, r: track.lap(own, first(number), r), rays)
         return lax.fori_loop(0, track.count, plane_step, (rays, totals))[1]
@@ -184,7 +213,12 @@ def _sweep_axis(
         jnp.zeros((bands, reads.probes.cell.shape[0]), real),
         jnp.zeros((track.count, bands, track.area), real) if fluence else None,
     )
-    return lax.fori_loop(0, ordinates.weight.shape[0], chunk_step, totals)
+    return lax.fori_loop(0, ordinates.chunks, chunk_step, totals)
+
+
+def _chunk(ordinates: Ordinates, number: Int[Array, ""]) -> Ordinates:
+    """One chunk of directions."""
+    return jax.tree.map(lambda a: a[number] if a.ndim else a, ordinates)
 
 
 def count_laps(
@@ -207,8 +241,9 @@ def count_laps(
     counted, longest = [], jnp.int32(1)
     for axis, own in enumerate(ordinates):
         if layout.pad[axis] == 0 and own.weight.shape[0]:
-            track = _track(layout, axis, dark, medium)
-            laps = lax.map(lambda chunk, track=track: chunk_laps(track, chunk), own)
+            track = _track(layout, axis, _fields(layout, axis, dark, medium, False)[0])
+            numbers = jnp.arange(own.weight.shape[0])
+            laps = lax.map(lambda chunk, track=track, own=own: chunk_laps(track, _chunk(own, chunk)), numbers)
             own, longest = eqx.tree_at(lambda o: o.laps, own, laps), jnp.maximum(longest, laps.max())
         counted.append(own)
     return tuple(counted), longest
@@ -407,7 +442,9 @@ def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinat
         if own.weight.shape[0] == 0:
             hits, probes = (jnp.zeros((0, 1, r.cell.shape[0]), jnp.uint32) for r in reads)
         else:
-            hits, probes = (lax.map(lambda chunk, r=r: _hit_bits(layout, axis, chunk, r), own) for r in reads)
+            numbers = jnp.arange(own.weight.shape[0])
+            bits = lambda reads: lax.map(lambda chunk: _hit_bits(layout, axis, _chunk(own, chunk), reads), numbers)
+            hits, probes = bits(reads.hits), bits(reads.probes)
         empty = lambda x: x is None
         return eqx.tree_at(lambda o: (o.hit_bits, o.probe_bits), own, (hits, probes), is_leaf=empty)
 

@@ -1,0 +1,211 @@
+"""What the medium adds to light along rays, and what it takes.
+
+With extinction s, scattering z, emission e and fluence phi, a segment of length l turns the radiance L behind it into
+
+    L' = L exp(-s l) + (z phi / 4 pi + e) l (1 - exp(-s l)) / (s l)                    (s = 0 is allowed)
+
+Where a coefficient differs between voxels a segment ends at every voxel's faces, and each voxel's own values hold;
+else segments are equal and at most a voxel's side long. The fluence is that at a segment's middle, interpolated.
+
+Public: `transmittance`, `march`, `fill`, `interpolate`; for blocks of rays `transmittance_between`, `march_between`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+from .scene import Scene
+from .unfolding import Axis, box_span, in_blocks, sloped, to_voxel, unfolded_axes
+
+
+def transmittance(scene: Scene, start: Float[Any, "n 3"], end: Float[Any, "n 3"]) -> Float[Array, "C n"]:
+    """exp(-optical depth) of the medium between `start` and `end`, as if there were no solids. Exact.
+
+    Outside the lattice there is no medium.
+    """
+    return in_blocks(_transmittance, scene, (start, end)).T
+
+
+def march(
+    scene: Scene,
+    fluence: Float[Array, "C nx ny nz"],
+    free: Float[Array, "nx ny nz"],
+    origins: Float[Any, "n 3"],
+    directions: Float[Any, "n 3"],
+    start: Float[Any, " n"],
+    stop: Float[Any, " n"],
+) -> tuple[Float[Array, "C n"], Float[Array, "C n"]]:
+    """What the medium sends back along rays between two distances, and how much of what lies behind it lets through.
+
+    `fluence` is interpolated between the voxels with `free` > 0; emission, scattering and absorption are each voxel's
+    own. Segments lie within the lattice (or its images), as those of `first_hit` do.
+    """
+    filled = fill(jnp.asarray(fluence), jnp.asarray(free))
+    arrays = (origins, directions, start, stop)
+    radiance, passed = in_blocks(march_between, (scene, filled), arrays)
+    return radiance.T, passed.T
+
+
+def fill(field: Float[Array, "C nx ny nz"], free: Float[Array, "nx ny nz"]) -> Float[Array, "C nx ny nz"]:
+    """`field` with values where `free` is 0: means over the neighbours that have one, two voxels deep."""
+    field, free = jnp.asarray(field), jnp.asarray(free)
+    return _fill(field, (free > 0).astype(field.dtype))
+
+
+@jax.jit
+def _fill(field: Array, known: Array) -> Array:
+    for _ in range(2):
+        total, count = field * known, known
+        for axis in (-3, -2, -1):
+            total, count = _three(total, axis), _three(count, axis)
+        field = jnp.where(known > 0, field, total / jnp.maximum(count, 1.0))
+        known = (count > 0).astype(field.dtype)
+    return field
+
+
+def _three(values: Array, axis: int) -> Array:
+    """Sums of neighbours along an axis."""
+    width = [(0, 0)] * values.ndim
+    width[axis] = (1, 1)
+    padded = jnp.pad(values, width)
+    n = values.shape[axis]
+    return sum(lax.slice_in_dim(padded, i, i + n, axis=axis % values.ndim) for i in range(3))  # pyright: ignore
+
+
+def interpolate(scene: Scene, filled: Float[Array, "C nx ny nz"], u: Float[Array, "n 3"]) -> Float[Array, "n C"]:
+    """Trilinear interpolation of a field without gaps, at unfolded voxel coordinates; level within half a voxel of a side."""
+    return _interpolate(unfolded_axes(scene), filled.reshape(filled.shape[0], -1), tuple(u.T)).T
+
+
+def _interpolate(axes: tuple[Axis, ...], flat: Array, u: tuple[Array, ...]) -> Array:
+    corners = []
+    for axis, x in zip(axes, u, strict=True):
+        floor = jnp.floor(x - 0.5)
+        after = x - 0.5 - floor
+        index = floor.astype(jnp.int32)
+        corners.append(((1 - after, axis.fold_index(index)), (after, axis.fold_index(index + 1))))
+    ny, nz = axes[1].count, axes[2].count
+    total = jnp.zeros((flat.shape[0], *u[0].shape), flat.dtype)
+    for a, i in corners[0]:
+        for b, j in corners[1]:
+            for c, k in corners[2]:
+                total = total + (a * b * c) * flat.at[:, (i * ny + j) * nz + k].get(mode="promise_in_bounds")
+    return total
+
+
+def _coefficients(scene: Scene) -> list[Array]:
+    """Scattering, absorption and emission, each (b, V) with b of 1 or C, and V of 1 if it is the same everywhere."""
+    assert scene.medium is not None
+    return [v.reshape(-1, v.shape[-1]).T for v in scene.medium.coefficients()]
+
+
+def _share(depth: Array) -> Array:
+    """(1 - exp(-depth)) / depth."""
+    small = depth < 1e-3
+    safe = jnp.where(small, 1.0, depth)
+    return jnp.where(small, 1 - depth / 2 + depth**2 / 6, -jnp.expm1(-safe) / safe)
+
+
+def _transmittance(scene: Scene, start: Array, end: Array) -> Array:
+    o, e = to_voxel(scene, start), to_voxel(scene, end)
+    length = jnp.sqrt(jnp.sum((e - o) ** 2, -1))
+    w = sloped((e - o) / jnp.where(length > 0, length, 1.0)[:, None])
+    into, out_of = box_span(scene, o, w)
+    into = jnp.clip(into, 0.0, length)
+    return transmittance_between(scene, o, w, into, jnp.clip(out_of, into, length))
+
+
+def transmittance_between(scene: Scene, o: Array, w: Array, start: Array, stop: Array) -> Float[Array, "n C"]:
+    """Transmittance between two distances along unfolded rays."""
+    spacing = scene.lattice.spacing
+    if scene.medium is None:
+        return jnp.ones((len(o), scene.bands), o.dtype)
+    scattering, absorption, _ = _coefficients(scene)
+    extinction = scattering + absorption
+    if extinction.shape[1] == 1:
+        depth = extinction * ((stop - start) * spacing)
+    else:
+        add = lambda depth, middle, voxel, length: depth + _at(extinction, voxel) * (length * spacing)
+        depth = _walk(unfolded_axes(scene), o, w, start, stop, add, jnp.zeros((len(extinction), len(o)), o.dtype))
+    return jnp.broadcast_to(jnp.exp(-depth), (scene.bands, len(o))).T
+
+
+def march_between(context: tuple[Scene, Array], origins: Array, directions: Array, start: Array, stop: Array):
+    """`march` for one block, from fluence without gaps."""
+    scene, filled = context
+    shape = (scene.bands, len(origins))
+    if scene.medium is None:
+        return jnp.zeros(shape, origins.dtype).T, jnp.ones(shape, origins.dtype).T
+    axes, spacing = unfolded_axes(scene), scene.lattice.spacing
+    flat = filled.reshape(filled.shape[0], -1).astype(origins.dtype)
+    # From the near end on, so that a far eye costs no precision.
+    start, stop = (jnp.where(jnp.isfinite(t), t, 0.0) for t in (start, stop))
+    w = sloped(directions)
+    o = to_voxel(scene, origins + start[:, None] * directions)
+    length = jnp.maximum(stop - start, 0.0) / spacing
+    coefficients = _coefficients(scene)
+    uniform = all(c.shape[1] == 1 for c in coefficients)
+
+    def add(state, middle, voxel, step):
+        radiance, depth = state
+        scattering, absorption, emission = (_at(c, voxel) for c in coefficients)
+        source = scattering / (4 * jnp.pi) * _interpolate(axes, flat, middle) + emission
+        own = (scattering + absorption) * (step * spacing)
+        return radiance + jnp.exp(-depth) * source * (step * spacing) * _share(own), depth + own
+
+    state = (jnp.zeros(shape, o.dtype), jnp.zeros(shape, o.dtype))
+    advance = _stride if uniform else _walk
+    radiance, depth = advance(axes, o, w, jnp.zeros_like(length), length, add, state)
+    return radiance.T, jnp.exp(-depth).T
+
+
+def _at(coefficient: Array, voxel: Array | None) -> Array:
+    if coefficient.shape[1] == 1 or voxel is None:
+        return coefficient
+    return coefficient.at[:, voxel].get(mode="promise_in_bounds")
+
+
+def _walk(axes: tuple[Axis, ...], o: Array, w: Array, start: Array, stop: Array, add: Callable, state: Any) -> Any:
+    """state = add(state, middle, voxel, length) for every voxel that rays cross between two distances."""
+    (ny, nz), xs, ws = (axes[1].count, axes[2].count), tuple(o.T), tuple(w.T)
+    index = tuple(jnp.floor(x + start * v).astype(jnp.int32) for x, v in zip(xs, ws, strict=True))
+
+    def step(carry):
+        t, index, state = carry
+        # Times of crossing from the indices, not by adding up: no drift.
+        planes = [(i + (v > 0) - x) / v for i, x, v in zip(index, xs, ws, strict=True)]
+        crossing = jnp.minimum(jnp.minimum(planes[0], planes[1]), planes[2])
+        after = jnp.clip(crossing, t, jnp.maximum(stop, t))
+        middle = tuple(x + 0.5 * (t + after) * v for x, v in zip(xs, ws, strict=True))
+        i, j, k = (axis.fold_index(n) for axis, n in zip(axes, index, strict=True))
+        state = add(state, middle, (i * ny + j) * nz + k, after - t)
+        going = after < stop
+        index = tuple(
+            n + jnp.where(going & (p <= crossing), jnp.where(v > 0, 1, -1), 0)
+            for n, p, v in zip(index, planes, ws, strict=True)
+        )
+        return after, index, state
+
+    return lax.while_loop(lambda carry: (carry[0] < stop).any(), step, (start, index, state))[2]
+
+
+def _stride(axes: tuple[Axis, ...], o: Array, w: Array, start: Array, stop: Array, add: Callable, state: Any) -> Any:
+    """The same in equal steps of at most a voxel's side, where the medium is the same everywhere."""
+    xs, ws = tuple(o.T), tuple(w.T)
+    count = jnp.ceil(stop - start)
+    length = (stop - start) / jnp.maximum(count, 1.0)
+
+    def step(carry):
+        number, state = carry
+        t = start + (number + 0.5) * length
+        middle = tuple(x + t * v for x, v in zip(xs, ws, strict=True))
+        return number + 1, add(state, middle, None, jnp.where(number < count, length, 0.0))
+
+    most = jnp.max(count, initial=0.0)
+    return lax.while_loop(lambda carry: carry[0] < most, step, (jnp.zeros((), o.dtype), state))[1]

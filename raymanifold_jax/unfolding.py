@@ -1,0 +1,144 @@
+"""Rays in voxel units and *unfolded* coordinates, and working on many of them.
+
+A ray is straight: behind a MIRROR or PERIODIC side lies another image of the lattice, and a point or voxel is folded
+back where the scene is asked about it. With n voxels along an axis,
+
+    PERIODIC: u -> u mod n,      MIRROR at 0: u -> |u|,      MIRROR at n: u -> n - |n - u|,
+
+and mirrors on both sides repeat after 2 n.
+
+For this package: `Axis`, `unfolded_axes`, `fold`, `to_voxel`, `to_scene`, `sloped`, `box_span`, `in_blocks`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from . import checks
+from .scene import MIRROR, PERIODIC, Scene
+
+_BLOCK = 1 << 14  # rays a call
+_BUNDLE = 1 << 10  # rays that step together: neighbours end at about the same time
+
+
+class Axis(NamedTuple):
+    """One axis of the unfolded lattice: its voxels, how it goes on, and where it ends."""
+
+    count: int
+    kind: str  # plain, periodic, mirrors, or a mirror at the lower or upper side
+    lower: float
+    upper: float
+
+    def fold_index(self, index: Array) -> Array:
+        n = self.count
+        if self.kind == "periodic":
+            return index % n
+        if self.kind == "mirrors":
+            index = index % (2 * n)
+        if self.kind == "lower":
+            index = jnp.where(index < 0, -1 - index, index)
+        elif self.kind != "plain":
+            index = jnp.where(index >= n, 2 * n - 1 - index, index)
+        return jnp.clip(index, 0, n - 1)
+
+    def fold(self, u: Array) -> tuple[Array, Array]:
+        """Coordinate in the lattice, and the sign that a direction gets."""
+        n = self.count
+        if self.kind == "periodic":
+            return u - n * jnp.floor(u / n), jnp.ones_like(u)
+        if self.kind == "mirrors":
+            u = u - 2 * n * jnp.floor(u / (2 * n))
+        if self.kind == "lower":
+            return jnp.abs(u), jnp.where(u < 0, -1.0, 1.0).astype(u.dtype)
+        if self.kind == "plain":
+            return u, jnp.ones_like(u)
+        return n - jnp.abs(n - u), jnp.where(u > n, -1.0, 1.0).astype(u.dtype)
+
+    def to_fold(self, u: Array, w: Array) -> Array:
+        """Distance to the next plane between images, along a ray with component w."""
+        plane = jnp.where(w > 0, jnp.floor(u / self.count) + 1, jnp.ceil(u / self.count) - 1) * self.count
+        return (plane - u) / w
+
+
+def unfolded_axes(scene: Scene) -> tuple[Axis, ...]:
+    sides, axes = scene.boundary.sides, []
+    for axis, n in enumerate(scene.lattice.shape):
+        below, above = (side is MIRROR for side in sides[2 * axis : 2 * axis + 2])
+        if sides[2 * axis] is PERIODIC:
+            axes.append(Axis(n, "periodic", -math.inf, math.inf))
+        elif below and above:
+            axes.append(Axis(n, "mirrors", -math.inf, math.inf))
+        else:
+            kind = "lower" if below else "upper" if above else "plain"
+            axes.append(Axis(n, kind, -n if below else 0, 2 * n if above else n))
+    return tuple(axes)
+
+
+def fold(axes: tuple[Axis, ...], u: Float[Array, "n 3"]) -> tuple[Array, Array]:
+    folded = [axis.fold(u[:, i]) for i, axis in enumerate(axes)]
+    return jnp.stack([f[0] for f in folded], -1), jnp.stack([f[1] for f in folded], -1)
+
+
+def to_voxel(scene: Scene, points: Array) -> Array:
+    return (points - jnp.asarray(scene.lattice.lower, points.dtype)) / scene.lattice.spacing
+
+
+def to_scene(scene: Scene, u: Array) -> Array:
+    return jnp.asarray(scene.lattice.lower, u.dtype) + u * scene.lattice.spacing
+
+
+def sloped(directions: Array) -> Array:
+    # No component is 0, so that distances to planes are large and not NaN.
+    return jnp.where(jnp.abs(directions) < 1e-20, 1e-20, directions)
+
+
+def box_span(scene: Scene, u: Array, w: Array) -> tuple[Array, Array]:
+    """Distances at which lines enter and leave the lattice's box."""
+    shape = jnp.asarray(scene.lattice.shape, u.dtype)
+    first, second = -u / w, (shape - u) / w
+    return jnp.minimum(first, second).max(-1), jnp.maximum(first, second).min(-1)
+
+
+def in_blocks(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
+    """function(scene, *arrays) for arrays (n, ...), some rays at a time; results have n as their first axis."""
+    real = jnp.zeros(0).dtype
+    if checks.is_traced((scene, arrays)):
+        return _in_bundles(function, scene, tuple(jnp.asarray(a, real) for a in arrays))
+    count = len(arrays[0])
+    # Few sizes, each compiled once: powers of two, then whole blocks.
+    block = min(_BLOCK, max(64, 1 << (max(count, 1) - 1).bit_length()))
+    arrays = tuple(_padded(np.asarray(a, real), block, np) for a in arrays)
+    parts = [_jitted(function, scene, tuple(a[i : i + block] for a in arrays)) for i in range(0, len(arrays[0]), block)]
+    return jax.tree.map(lambda *r: jnp.concatenate(r)[:count], *parts)
+
+
+@eqx.filter_jit
+def _jitted(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
+    return _in_bundles(function, scene, arrays)
+
+
+def _in_bundles(function: Callable, scene: Any, arrays: tuple[Array, ...]) -> Any:
+    count = len(arrays[0])
+    if count <= _BUNDLE:
+        return function(scene, *arrays)
+    bundles = tuple(_padded(a, _BUNDLE, jnp).reshape(-1, _BUNDLE, *a.shape[1:]) for a in arrays)
+    results = lax.map(lambda parts: function(scene, *parts), bundles)
+    return jax.tree.map(lambda r: r.reshape(-1, *r.shape[2:])[:count], results)
+
+
+def _padded(values: Any, block: int, xp: Any) -> Any:
+    short = -len(values) % block if len(values) else block
+    if not short:
+        return values
+    # Rays like the last one: no longer to trace than the rest.
+    last = values[-1:] if len(values) else xp.ones((1, *values.shape[1:]), values.dtype)
+    return xp.concatenate([values, xp.broadcast_to(last, (short, *values.shape[1:]))])
