@@ -116,7 +116,7 @@ def interpolate_irradiance(
     near = values[element]
     there = near - jnp.einsum("nkci,nki->nkc", slope[element], arm)
     result = jnp.einsum("nk,nkc->nc", weight, there)
-    around = (facing > 0.1)[..., None] & (squared < 4.0)[..., None]
+    around = (facing > 0.1)[..., None] & (squared < 6.0)[..., None]
     low = jnp.min(jnp.where(around, near, jnp.inf), 1)
     high = jnp.max(jnp.where(around, near, -jnp.inf), 1)
     margin = _BEYOND * (high - low)

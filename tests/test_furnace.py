@@ -67,6 +67,7 @@ def test_convex_body_sees_only_the_sky(albedo):
     assert np.sqrt(np.average(error**2, weights=surfaces.areas)) < 0.005 * false_share
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("row", [r for r in problems.table("closed_enclosures.csv") if r["case"].startswith("sphere")])
 def test_sphere_filled_with_an_absorbing_medium(row):
     # Exercises the medium next to concave CUT voxels. Error budget: measured -0.5 to -1.3 % at a radius of 6.4 voxels, and

@@ -300,7 +300,8 @@ def test_solids_do_not_darken_the_fluence_beside_them():
     free = np.ones((N, N, N))
     light[..., : N // 2], free[..., : N // 2] = 0, 0
     scene = rm.Scene(LATTICE, medium=rm.Medium(1e-4))
-    radiance, _ = march(scene, light, free, [[0.1, 0.5, 0.5 + 0.1 * VOXEL]], [[1.0, 0, 0]], [0.0], [0.8])
+    ray = ([[0.1, 0.5, 0.5 + 0.1 * VOXEL]], [[1.0, 0, 0]], [0.0], [0.8])
+    radiance, _ = march(scene, jnp.asarray(light), jnp.asarray(free), *ray)
     assert_close(radiance, 1e-4 * 0.8 / (4 * np.pi), rtol=1e-3)
 
 
