@@ -132,8 +132,8 @@ def outgoing_flux(solution: Solution, side: str) -> Float[Array, "nu nv *bands"]
     number, scene, elements = _SIDES.index(side), solution.scene, solution.elements
     kind = scene.boundary.sides[number]
     if kind is not OPEN:
-        advice = "no light leaves through others; make it OPEN in Boundary(...)"
-        checks.fail("side", f"{side}, which is {'a Wall' if isinstance(kind, Wall) else kind!r}", "an OPEN side", advice)
+        got = f"{side}, which is {'a Wall' if isinstance(kind, Wall) else kind.name}"
+        checks.fail("side", got, "an OPEN side", "no light leaves through others; make it OPEN in Boundary(...)")
     kept = np.nonzero(elements.open & (elements.side == number))[0]
     u, v = (axis for axis in range(3) if axis != number // 2)
     share = jnp.asarray(elements.area[kept] / scene.lattice.spacing**2, solution.diffuse_irradiance.dtype)

@@ -147,7 +147,11 @@ def _solid_elements(scene: Scene, field: _DistanceField, distance: np.ndarray) -
     position = center + joined.pop("centroid") * lattice.spacing
     material = field.nearest(position).astype(int)
     joined["area"] = joined["area"] * lattice.spacing**2
-    return _elements({**joined, "position": position, "material": material}, side=-1, is_open=False)
+    # The underside of a solid that stands on a side of the domain faces out of it: no surface of this scene.
+    ahead = position + 0.02 * lattice.spacing * joined["normal"]
+    beyond = ((ahead < lattice.lower) | (ahead > lattice.upper)) & ~np.array(scene.boundary.periodic)
+    rows = {**joined, "position": position, "material": material}
+    return _elements({key: value[~beyond.any(1)] for key, value in rows.items()}, side=-1, is_open=False)
 
 
 def _faces(scene: Scene, field: _DistanceField, voxels: np.ndarray, distance: np.ndarray) -> dict[str, np.ndarray]:
@@ -241,8 +245,10 @@ def _plane_offset(field: _DistanceField, center: np.ndarray, normal: np.ndarray,
     aligned = np.einsum("msi,mi->ms", slope, normal) > 0.999
     height = np.broadcast_to(steps, (len(center), starts.shape[1], len(steps))).reshape(len(center), -1)
     estimate = np.where(aligned & (np.abs(value) < 0.2), height - value, np.nan)
-    with np.errstate(all="ignore"):
-        return -np.nanmedian(estimate, axis=1)
+    met = np.isfinite(estimate).any(1)
+    offset = np.full(len(center), np.nan)
+    offset[met] = -np.nanmedian(estimate[met], axis=1)
+    return offset
 
 
 def patch_points(normal: np.ndarray, offset: np.ndarray, count: int = _PATCH) -> tuple[np.ndarray, np.ndarray]:

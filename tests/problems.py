@@ -47,6 +47,7 @@ def walls(albedo: Any, emission: Any = 0.0, top: Any = None) -> rm.Boundary:
 
 
 BALL = rm.Sphere((0.45, 0.52, 0.4), 0.27)
+BLOCK = rm.Box((0.25, 0.25, 0), (0.75, 0.5, 0.5))
 SPHERICAL_CAVITY = rm.Box((-1, -1, -1), (2, 2, 2)).difference(rm.Sphere((0.5, 0.5, 0.5), 0.4))
 
 
@@ -56,9 +57,10 @@ def furnace(cavity: str, albedo: float, medium: rm.Medium | None = None, n: int 
         B = 1 / (1 - rho)
 
     everywhere, as is pi times the radiance, whatever medium of scattering albedo 1 fills it (`closed_enclosures.csv`). In
-    voxels the expected fluence is 4 B. `cavity`: "box", "ball" (a box with a ball in it) or "sphere".
+    voxels the expected fluence is 4 B. `cavity`: "box", "ball" (a box with a ball in it), "block" (a box with a block on its
+    floor) or "sphere".
     """
-    shapes = {"box": [], "ball": [BALL], "sphere": [SPHERICAL_CAVITY]}[cavity]
+    shapes = {"box": [], "ball": [BALL], "block": [BLOCK], "sphere": [SPHERICAL_CAVITY]}[cavity]
     solids = [rm.Solid(shape, albedo, UNIT_EXITANCE) for shape in shapes]
     scene = rm.Scene(cube(n), solids, medium, boundary=walls(albedo, UNIT_EXITANCE))
     return Problem(scene, 1 / (1 - albedo))

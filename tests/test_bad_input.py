@@ -48,8 +48,8 @@ def test_rtol_may_be_smaller_in_64_bits(x64):
 
 
 def test_light_that_goes_round_for_ever():
-    # Nothing stops a ray between two mirrors along one axis and around a periodic lattice along the others.
-    scene = rm.Scene(rm.Lattice((2, 2, 2)), boundary=rm.Boundary(rm.PERIODIC, rm.PERIODIC, rm.PERIODIC))
+    # Nothing stops a ray in an empty lattice that is periodic along every axis.
+    scene = rm.Scene(rm.Lattice((1, 1, 1)), boundary=rm.Boundary(rm.PERIODIC, rm.PERIODIC, rm.PERIODIC))
     with pytest.raises(ValueError, match=r"laps of a periodic axis.*close or open another side, or add absorption"):
         rm.solve(scene, rm.quadrature.fibonacci(12), progress=False)
 
@@ -122,7 +122,7 @@ def test_radiance_refuses(solution, origins, directions, message):
     [
         ("top", r"side: got 'top', expected one of x-, x\+, y-, y\+, z-, z\+"),
         (5, r"side: got 5, expected one of"),
-        ("x-", r"side: got x-, which is a Wall, expected an OPEN side"),
+        ("x-", r"side: got x-, which is '?a Wall'?, expected an OPEN side"),
     ],
 )
 def test_outgoing_flux_refuses(solution, side, message):

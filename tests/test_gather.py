@@ -27,9 +27,10 @@ def stand_in(scene: rm.Scene, irradiance: Any = 0.0, fluence: Any = 0.0) -> Solu
     """A solution with this diffuse irradiance, a number, (C, 1) or a function of positions, and this diffuse fluence."""
     surfaces = find_surfaces(scene)
     bands, count = scene.bands, len(surfaces)
-    values = irradiance(surfaces.position) if callable(irradiance) else irradiance
+    values: Any = irradiance(surfaces.position) if callable(irradiance) else irradiance
     free = jnp.asarray(~surfaces.solid, float)
-    field = jnp.broadcast_to(fluence(scene.lattice.centers()) if callable(fluence) else fluence, (bands, *free.shape)) * free
+    light: Any = fluence(scene.lattice.centers()) if callable(fluence) else fluence
+    field = jnp.broadcast_to(light, (bands, *free.shape)) * free
     owners: list[Any] = [*scene.solids, *(s if isinstance(s, rm.Wall) else None for s in scene.boundary.sides)]
     of = lambda name: jnp.stack([jnp.broadcast_to(getattr(o, name, 0.0), (bands,)) for o in owners], 1)[:, surfaces.material]
     return Solution(
