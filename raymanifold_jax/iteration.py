@@ -8,7 +8,7 @@ and after one more step x' = b + K x the same with K's largest row sum as a furt
 adds up to less than 1; else w = 1 + K 1 + K^2 1 + ..., until every path of light has had a chance to end. The last change is
 no such bound: at albedo 0.99 it can be 100 times smaller than the error.
 
-- `Jacobi` adds up orders of bounced light: the k-th iterate holds light of up to k bounces (Langer, Breton & Zucker 1995, eq. 1).
+- `Jacobi` adds up orders of bounced light: the k-th iterate holds light of up to k bounces (Langer et al. 1995, eq. 1).
 - `Krylov` takes the combination of the last few orders that leaves the smallest residual (GMRES: Saad & Schultz, SIAM J. Sci.
   Stat. Comput. 7, 1986), restarted. Each sweep serves it at least as well as it serves Jacobi.
 
@@ -154,7 +154,7 @@ def _add(total: Light, lost: Light, order: Light) -> tuple[Light, Light]:
 
 
 class Krylov(eqx.Module):
-    """GMRES on (I - K) x = b, restarted every `restart` sweeps: about half of Jacobi's sweeps, in 2 `restart` + 1 fields more."""
+    """GMRES on (I - K) x = b, restarted: half of Jacobi's sweeps or fewer, 2 `restart` + 1 fields more."""
 
     restart: int = eqx.field(static=True, default=8)
 

@@ -56,7 +56,7 @@ def test_light_that_goes_round_for_ever():
 
 @pytest.fixture(scope="module")
 def solution():
-    return rm.solve(SCENE, rm.quadrature.fibonacci(12), progress=False)
+    return rm.solve(SCENE, rm.quadrature.fibonacci(60), progress=False)
 
 
 UP = [0.0, 0.0, 1.0]

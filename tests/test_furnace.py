@@ -37,9 +37,6 @@ def test_closed_cavity(cavity, albedo):
     assert_uniform(furnace_solution(problem), problem.expected, 1.05 * RTOL)
 
 
-@pytest.mark.xfail(
-    strict=True, reason="the underside of a solid that stands on a side of the lattice gets elements that no light reaches"
-)
 @pytest.mark.parametrize("albedo", [0.5, 0.95])
 def test_closed_cavity_with_a_block_on_its_floor(albedo):
     # As above; what the block covers does not count.

@@ -1,7 +1,7 @@
 """Surface elements: their areas, normals and places.
 
-Error budget: a plane in each voxel is exact for flat aligned faces. On curved ones areas are to 1 % where the radius of curvature
-is 5 voxels or more, to 5 % at 2.4 voxels; on slanted faces with edges to 3 to 5 % at 16 voxels a side.
+Error budget: a plane in each voxel is exact for flat aligned faces. On curved ones areas are to 1 % where the radius of
+curvature is 5 voxels or more, to 5 % at 2.4 voxels; on slanted faces with edges to 3 to 5 % at 16 voxels a side.
 """
 
 import numpy as np
@@ -52,8 +52,8 @@ def test_normals_are_unit_and_outward_and_positions_on_the_surface(shape):
 
 
 def test_ball_normals_point_from_its_centre():
-    # Error budget: a plane is tangent near the middle of its patch. Half a voxel is 0.09 radians; some patches of a twentieth of
-    # a voxel's face are 0.12 off.
+    # Error budget: a plane is tangent near the middle of its patch. Half a voxel is 0.09 radians; patches of a twentieth
+    # of a voxel's face are 0.12 off.
     found = elements(CURVED["ball"][0])
     radial = found.position - (0.48, 0.51, 0.53)
     cosine = np.einsum("ei,ei->e", found.normal, radial) / np.linalg.norm(radial, axis=1)
