@@ -138,16 +138,17 @@ def small_emitters(scene: Scene, surfaces: Surfaces) -> EmitterPoints | None:
         return None
     side = int(np.ceil(np.sqrt(_EMITTER_POINTS / len(emitters))))
     spacing = scene.lattice.spacing
-    patch, inside = patch_points(surfaces.normal[emitters], surfaces.offset[emitters], side)
+    patch, weight = patch_points(surfaces.normal[emitters], surfaces.offset[emitters], side)
     center = scene.lattice.lower + (surfaces.voxel[emitters] + 0.5) * spacing
     position = center[:, None] + patch * spacing
     normal = np.broadcast_to(surfaces.normal[emitters][:, None], position.shape)
     # Of a face that is only partly the emitter's, keep that part.
     behind = np.asarray(scene.distance(jnp.asarray(position - 0.02 * spacing * normal))) < 0
     flush = (surfaces.side[emitters] >= 0) & (surfaces.material[emitters] < len(scene.solids))
-    keep = inside & (behind | ~flush[:, None])
-    keep[~keep.any(1), 0] = True
-    share = keep / keep.sum(1, keepdims=True)
+    weight = np.where(behind | ~flush[:, None], weight, 0.0)
+    weight[~weight.any(1), 0] = 1.0
+    keep = weight > 0
+    share = weight / weight.sum(1, keepdims=True)
     area = (surfaces.area[emitters][:, None] * share)[keep]
     owner = np.broadcast_to(surfaces.material[emitters][:, None], keep.shape)[keep]
     radiance = jnp.stack([jnp.broadcast_to(getattr(o, "emission", jnp.zeros(())), (scene.bands,)) for o in owners], 1)

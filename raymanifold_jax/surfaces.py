@@ -21,8 +21,9 @@ import numpy as np
 
 from .scene import OPEN, Scene, Wall
 
-#: Faces whose normals differ by more than this (as a cosine) become elements of their own.
-_SAME_FACE = 0.7
+#: Cosine between the normals of neighbouring points of one face: a sharper edge parts two faces, each an element of its own.
+_SAME_FACE = 0.9
+_FACES = 6  # faces told apart in a voxel, at most
 #: Points this far behind a face (voxels) decide which voxel owns it: the one on the solid side.
 _INWARD = 1e-3
 _PATCH = 8  # samples a side on an element's plane
@@ -54,10 +55,9 @@ class Surfaces:
     @property
     def probe(self) -> np.ndarray:
         """(E, 3) the voxel that stands in where no ray hits: the element's own if its centre is outside the solid."""
-        axis = np.argmax(np.abs(self.normal), axis=1)
-        step = np.zeros_like(self.voxel)
-        rows = np.arange(len(self))
-        step[rows, axis] = np.sign(self.normal[rows, axis]).astype(int)
+        size = np.abs(self.normal)
+        # Along the dominant axis, or all of them on a diagonal: so that a turned scene has the turned probes.
+        step = np.sign(self.normal).astype(int) * (size > size.max(1, keepdims=True, initial=0) - 1e-6)
         return self.voxel + np.where(self.offset > 0, 0, 1)[:, None] * step
 
 
@@ -161,7 +161,9 @@ def _faces(scene: Scene, field: _DistanceField, voxels: np.ndarray, distance: np
     normals, has_face = _distinct_normals(field, center, spacing)
     # Where the surface is smooth the distance at the centre gives the plane itself.
     own_distance, own_normal = field.gradient(center)
-    smooth = (np.abs(np.linalg.norm(own_normal, axis=1) - 1) < 1e-3) & (has_face.sum(1) <= 1)
+    foot = center - (own_distance * spacing)[:, None] * own_normal
+    smooth = (np.linalg.norm(own_normal, axis=1) > 1 - 1e-3) & (has_face.sum(1) <= 1)
+    smooth &= _slopes(field, foot, own_normal, spacing)[1]
     has_face[smooth, 0] = True
     normals[smooth, 0] = own_normal[smooth]
     rows, which = np.nonzero(has_face)
@@ -171,16 +173,18 @@ def _faces(scene: Scene, field: _DistanceField, voxels: np.ndarray, distance: np
     on_plane[creased] = _plane_offset(field, center[rows[creased]], normal[creased], spacing)
     # Planes through the middle of their patch: the tangent at the point nearest the centre would stand proud of a ball.
     rounded = ~creased
-    normal[rounded], on_plane[rounded] = _refit(field, center[rows[rounded]], normal[rounded], on_plane[rounded], spacing)
-    patch, inside = patch_points(normal, on_plane)
-    error = field.distance(center[rows, None] + patch * spacing)
-    real = inside & (np.abs(error) < 0.1)
-    count, whole = real.sum(1), inside.sum(1)
-    area = plane_area_in_voxel(normal, on_plane) * np.where(creased, count / np.maximum(whole, 1), 1.0)
+    for _ in range(2):
+        normal[rounded], on_plane[rounded] = _refit(field, center[rows[rounded]], normal[rounded], on_plane[rounded], spacing)
+    patch, weight = patch_points(normal, on_plane)
+    # The plane is the face as far as the distance's slope is its normal: past an edge it is not.
+    error, slope = field.gradient(center[rows, None] + patch * spacing)
+    real = weight * ((np.abs(error) < np.where(creased, 0.1, 0.5)[:, None]) & (np.einsum("msi,mi->ms", slope, normal) > 0.7))
+    covered, whole = real.sum(1), weight.sum(1)
+    area = plane_area_in_voxel(normal, on_plane) * covered / np.maximum(whole, 1e-9)
     half_width = 0.5 * np.abs(normal).sum(1)
     owned = (on_plane < half_width - 1e-6) & (on_plane >= -half_width - 1e-6)
-    keep = owned & (count > 0.02 * _PATCH**2) & (area > 1e-3) & np.isfinite(on_plane)
-    centroid = (patch * real[..., None]).sum(1) / np.maximum(count, 1)[:, None]
+    keep = owned & (covered > 0.02) & (area > 1e-3) & np.isfinite(on_plane)
+    centroid = (patch * real[..., None]).sum(1) / np.maximum(covered, 1e-9)[:, None]
     return {
         "voxel": voxels[rows][keep], "normal": normal[keep], "offset": on_plane[keep], "area": area[keep],
         "centroid": centroid[keep],
@@ -189,21 +193,22 @@ def _faces(scene: Scene, field: _DistanceField, voxels: np.ndarray, distance: np
 
 def _refit(field: _DistanceField, center, normal, offset, spacing: float) -> tuple[np.ndarray, np.ndarray]:
     """Move planes so that over their patches in the voxel the signed distance averages 0 and its slope is theirs."""
-    patch, inside = patch_points(normal, offset)
+    patch, weight = patch_points(normal, offset)
     value, slope = field.gradient(center[:, None] + patch * spacing)
-    count = np.maximum(inside.sum(1), 1)
-    mean_value = (value * inside).sum(1) / count
-    mean_slope = (slope * inside[..., None]).sum(1) / count[:, None]
+    area = weight.sum(1)
+    share = weight / np.maximum(area, 1e-9)[:, None]
+    mean_value = (value * share).sum(1)
+    mean_slope = (slope * share[..., None]).sum(1)
     length = np.linalg.norm(mean_slope, axis=1)
-    middle = (patch * inside[..., None]).sum(1) / count[:, None]
-    usable = inside.any(1) & (length > 0.9) & (np.abs(mean_value) < 0.3)
+    middle = (patch * share[..., None]).sum(1)
+    usable = (area > 0) & (length > 0.9) & (np.abs(mean_value) < 0.3)
     refitted = mean_slope / np.maximum(length, 1e-12)[:, None]
     through = mean_value - np.einsum("mi,mi->m", refitted, middle)
     return np.where(usable[:, None], refitted, normal), np.where(usable, through, offset)
 
 
 def _distinct_normals(field: _DistanceField, center: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
-    """Up to three distinct surface normals in each voxel: (M, 3, 3) and which of them exist (M, 3)."""
+    """Distinct surface normals in each voxel: (M, faces, 3) and which of them exist (M, faces)."""
     side = (np.arange(4) + 0.5) / 4 - 0.5
     samples = np.stack(np.meshgrid(side, side, side, indexing="ij"), -1).reshape(-1, 3)
     points = center[:, None] + samples * spacing
@@ -211,21 +216,66 @@ def _distinct_normals(field: _DistanceField, center: np.ndarray, spacing: float)
         value, slope = field.gradient(points)
         points = points - (value * spacing)[..., None] * slope
     value, _ = field.gradient(points)
-    _, slope = field.gradient(points + 1e-4 * spacing * slope)
+    slope, clear = _slopes(field, points, slope, spacing)
     behind = (points - center[:, None]) / spacing - _INWARD * slope
     valid = (np.abs(behind).max(-1) <= 0.5) & (np.abs(value) < 0.02)
-    valid &= np.abs(np.linalg.norm(slope, axis=-1) - 1) < 1e-3
-    normals = np.zeros((len(center), 3, 3))
-    exists = np.zeros((len(center), 3), bool)
-    rows = np.arange(len(center))
-    for face in range(3):
-        seed = np.argmax(valid, axis=1)
-        exists[:, face] = valid[rows, seed]
-        same = valid & (np.einsum("msi,mi->ms", slope, slope[rows, seed]) > _SAME_FACE)
-        mean = (slope * same[..., None]).sum(1)
-        normals[:, face] = mean / np.maximum(np.linalg.norm(mean, axis=1, keepdims=True), 1e-12)
-        valid &= ~same
-    return normals, exists
+    valid &= clear
+    label = _label_faces(valid, slope)
+    member = label[:, None] == np.arange(_FACES)[:, None]
+    mean = np.einsum("mfs,msi->mfi", member.astype(float), slope)
+    length = np.linalg.norm(mean, axis=2, keepdims=True)
+    return mean / np.maximum(length, 1e-12), member.any(2) & (length[..., 0] > 1e-6)
+
+
+def _slopes(field: _DistanceField, points: np.ndarray, outward: np.ndarray, spacing: float) -> tuple[np.ndarray, np.ndarray]:
+    """The distance's slope just outside the surface at some points on it, and whether it is a face's.
+
+    On an edge it is not: the two sides of the surface disagree there.
+    """
+    step = 1e-4 * spacing * outward
+    slope, below = (field.gradient(points + s)[1] for s in (step, -step))
+    unit = np.abs(np.linalg.norm(slope, axis=-1) - 1) < 1e-3
+    return slope, unit & (np.sum(slope * below, axis=-1) > 0.999)
+
+
+def _label_faces(valid: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    """Which face each sample of a voxel lies on, 0.. (M, S); -1: none, or past the last face told apart.
+
+    Samples are on one face if steps between similar normals join them: a curved face stays one, whichever way it is turned.
+    """
+    label = np.where(valid, 0, -1)
+    mean = (slope * valid[..., None]).sum(1, keepdims=True)
+    mean /= np.maximum(np.linalg.norm(mean, axis=2, keepdims=True), 1e-12)
+    unlike = valid & (np.einsum("msi,mti->ms", slope, mean) < _SAME_FACE)
+    creased = np.nonzero(unlike.any(1))[0]
+    for rows in np.array_split(creased, max(1, -(-len(creased) // 4096))):
+        label[rows] = _join(valid[rows], slope[rows])
+    return label
+
+
+def _join(valid: np.ndarray, slope: np.ndarray) -> np.ndarray:
+    count = valid.shape[1]
+    alike = np.einsum("msi,mti->mst", slope, slope) > _SAME_FACE
+    alike &= valid[:, :, None] & valid[:, None]
+    first = np.where(valid, np.arange(count), count)  # the first sample of each sample's face
+    while True:
+        joined = np.minimum(first, np.where(alike, first[:, None], count).min(2))
+        if np.array_equal(joined, first):
+            break
+        first = joined
+    mean = np.einsum("mst,mti->msi", (first[:, :, None] == first[:, None]).astype(float), slope * valid[..., None])
+    mean /= np.maximum(np.linalg.norm(mean, axis=2, keepdims=True), 1e-12)
+    # A face that turns right round in the voxel is parted by the axes its normals point along.
+    apart = valid & (np.einsum("msi,msi->ms", slope, mean) < 0.3)
+    turned = np.any((first[:, :, None] == first[:, None]) & apart[:, None], axis=2)
+    axis = np.argmax(np.abs(slope), axis=2)
+    sense = np.take_along_axis(slope, axis[..., None], 2)[..., 0] > 0
+    first = np.where(turned & valid, count + 1 + 2 * axis + sense, first)
+    names = np.arange(count + 7)
+    present = (first[:, :, None] == names).any(1) & (names != count)
+    rank = np.cumsum(present, axis=1) - 1
+    label = np.take_along_axis(rank, first, 1)
+    return np.where(valid & (label < _FACES), label, -1)
 
 
 def _plane_offset(field: _DistanceField, center: np.ndarray, normal: np.ndarray, spacing: float) -> np.ndarray:
@@ -252,19 +302,21 @@ def _plane_offset(field: _DistanceField, center: np.ndarray, normal: np.ndarray,
 
 
 def patch_points(normal: np.ndarray, offset: np.ndarray, count: int = _PATCH) -> tuple[np.ndarray, np.ndarray]:
-    """Points on each plane, on a grid along its dominant axis: (M, n*n, 3) from the centre, and which lie in the voxel."""
-    axis = np.argmax(np.abs(normal), axis=1)
-    rows = np.arange(len(normal))
+    """Points on each plane, (M, 3 n^2, 3) from the voxel's centre, and the area each stands for: 0 outside the voxel.
+
+    There is one grid along each axis; their shares n_x^2 + n_y^2 + n_z^2 = 1 treat all axes alike.
+    """
     grid = (np.arange(count) + 0.5) / count - 0.5
     a, b = (g.ravel() for g in np.meshgrid(grid, grid, indexing="ij"))
-    points = np.zeros((len(normal), count**2, 3))
-    u, v = (axis + 1) % 3, (axis + 2) % 3
-    points[rows, :, u] = a
-    points[rows, :, v] = b
-    slope = np.where(normal[rows, axis] >= 0, 1, -1) * np.maximum(np.abs(normal[rows, axis]), 1e-6)
-    height = -(offset[:, None] + normal[rows, u, None] * a + normal[rows, v, None] * b) / slope[:, None]
-    points[rows, :, axis] = height
-    return np.nan_to_num(points, nan=9.0), np.abs(np.nan_to_num(height, nan=9.0)) <= 0.5 + 1e-6
+    points, weights = np.zeros((len(normal), 3, count**2, 3)), np.zeros((len(normal), 3, count**2))
+    for axis in range(3):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        along = normal[:, axis, None]
+        slope = np.where(along >= 0, 1, -1) * np.maximum(np.abs(along), 1e-6)
+        height = np.nan_to_num(-(offset[:, None] + normal[:, u, None] * a + normal[:, v, None] * b) / slope, nan=9.0)
+        points[:, axis, :, u], points[:, axis, :, v], points[:, axis, :, axis] = a, b, np.clip(height, -9, 9)
+        weights[:, axis] = (np.abs(height) <= 0.5 + 1e-6) * np.where(np.abs(along) > 1e-3, np.abs(along), 0.0) / count**2
+    return points.reshape(len(normal), -1, 3), weights.reshape(len(normal), -1)
 
 
 def plane_area_in_voxel(normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
