@@ -22,7 +22,7 @@ from .layout import Layout, Ordinates, make_ordinates
 from .quadrature import Quadrature
 from .scene import Scene, Wall
 from .surfaces import Surfaces
-from .transport.characteristic import Inflow, SweptMedium, count_laps, mark_hits, sweep
+from .transport.characteristic import Inflow, SweptMedium, count_laps, mark_hits, sweep, thin_limit
 
 _MOST_LAPS = 1 << 16
 _TRACE = 1e-7  # optical depth a voxel
@@ -103,11 +103,12 @@ class Transport(eqx.Module):
     extinction: Float[Array, "C X Y Z"] | None
     element_sums: Float[Array, " E"]
     voxel_sums: Float[Array, "nx ny nz"]
+    thin: bool = eqx.field(static=True)
 
     @eqx.filter_jit
     def __call__(self, leaving: Light, inflow: Inflow | None = None, fluence: bool = True) -> Light:
         """Mean radiance arriving at elements and in voxels, of what leaves them and of what comes in through open sides."""
-        sums = _sweep(self.layout, self.ordinates, self.extinction, leaving, inflow, fluence)
+        sums = _sweep(self.layout, self.ordinates, self.extinction, self.thin, leaving, inflow, fluence)
         elements = _ratio(sums.elements, self.element_sums)
         return Light(elements, None if sums.voxels is None else _ratio(sums.voxels, self.voxel_sums))
 
@@ -116,22 +117,22 @@ def _ratio(sums: Array, furnace: Array) -> Array:
     return jnp.where(furnace > 0, sums / jnp.where(furnace > 0, furnace, 1.0), 0.0)
 
 
-def _sweep(layout, ordinates, extinction, leaving: Light, inflow: Inflow | None, fluence: bool) -> Light:
+def _sweep(layout, ordinates, extinction, thin, leaving: Light, inflow: Inflow | None, fluence: bool) -> Light:
     medium = None
     if extinction is not None:
         dark = jnp.zeros((extinction.shape[0], *layout.shape), extinction.dtype)
-        medium = SweptMedium(extinction, layout.to_padded(dark if leaving.voxels is None else leaving.voxels))
+        medium = SweptMedium(extinction, layout.to_padded(dark if leaving.voxels is None else leaving.voxels), thin)
     return Light(*sweep(layout, ordinates, leaving.elements, medium, inflow, fluence))
 
 
 @eqx.filter_jit
-def _furnace(layout: Layout, ordinates, extinction) -> tuple[tuple, Array, Array]:
+def _furnace(layout: Layout, ordinates, extinction, thin: bool) -> tuple[tuple, Array, Array]:
     """Mark the hits, and sweep a uniform radiance of 1: the sums at elements and, outside solids, in voxels."""
     ordinates = mark_hits(layout, ordinates)
     first = None if extinction is None else extinction[:1]
     voxels = None if first is None else jnp.ones((1, *layout.shape), first.dtype)
     leaving = Light(jnp.ones((1, layout.elements), layout.plane.dtype), voxels)
-    sums = _sweep(layout, ordinates, first, leaving, None, True)
+    sums = _sweep(layout, ordinates, first, thin, leaving, None, True)
     assert sums.voxels is not None
     return ordinates, sums.elements[0], jnp.where(_solid(layout), 0.0, sums.voxels[0])
 
@@ -158,6 +159,7 @@ def make_transport(
     largest_plane = int(np.prod(sorted(layout.padded)[1:]))
     ordinates = make_ordinates(quadrature, bands, largest_plane)
     padded = None if extinction is None else layout.to_padded(extinction)
+    thin = extinction is not None and bool(jnp.max(extinction) * (np.sqrt(3) * layout.spacing) <= thin_limit(extinction.dtype))
     if 0 in layout.pad:
         ordinates, longest = eqx.filter_jit(count_laps)(layout, ordinates, padded, _MOST_LAPS)
         if int(longest) >= _MOST_LAPS:
@@ -165,5 +167,5 @@ def make_transport(
                 f"boundary: some rays are still going after {_MOST_LAPS} laps of a periodic axis; expected every ray to meet "
                 "a surface, an open side or an absorbing medium; close or open another side, or add absorption"
             )
-    ordinates, element_sums, voxel_sums = _furnace(layout, ordinates, padded)
-    return Transport(layout, ordinates, padded, element_sums, voxel_sums)
+    ordinates, element_sums, voxel_sums = _furnace(layout, ordinates, padded, thin)
+    return Transport(layout, ordinates, padded, element_sums, voxel_sums, thin)

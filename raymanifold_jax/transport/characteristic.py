@@ -11,7 +11,7 @@ with S the source function. A surface is the plane g(e) = offset + n . e = 0 in 
 changes from + to - along a segment the ray arrives at the surface and leaves as the surface's exitant radiance; where it
 changes from - to +, the free part begins at the surface.
 
-Public: `Characteristic`, `sweep`, `SweptMedium`, `Inflow`, `mark_hits`, `count_laps`.
+Public: `Characteristic`, `sweep`, `SweptMedium`, `Inflow`, `mark_hits`, `count_laps`, `thin_limit`.
 """
 
 from __future__ import annotations
@@ -32,7 +32,11 @@ from ..shift import shift
 #: A ray counts as arriving at an element if it is at most this far (voxels) behind its plane where it enters the voxel: the
 #: planes of neighbouring voxels on a curved surface do not join exactly.
 _BEHIND = 0.05
-_THIN = 0.05  # below this optical length, (1 - exp(-tau)) / tau by its series
+
+
+def thin_limit(real) -> float:
+    """Up to this optical length (1 - exp(-tau)) / tau comes by its series: as exact, at a third of an exponential's cost."""
+    return 0.35 if jnp.finfo(real).bits <= 32 else 0.02
 
 
 class Characteristic(eqx.Module):
@@ -44,6 +48,7 @@ class SweptMedium(eqx.Module):
 
     extinction: Float[Array, "C X Y Z"]  # 1 / scene unit
     source: Float[Array, "C X Y Z"]  # source function, W m^-2 sr^-1
+    thin: bool = eqx.field(static=True, default=False)  # no path through a voxel is optically longer than `thin_limit`
 
 
 class Inflow(eqx.Module):
@@ -56,6 +61,7 @@ class Chords(NamedTuple):
     """The three segments of each direction's rays between two planes; [D] each, points relative to the voxel's centre."""
 
     ends: tuple  # ((e_axis, e_u, e_v) entry, the same exit) of each segment
+    step: tuple  # (+-1, p, q): the way from one plane to the next
     share: tuple  # each segment's share of the step
     offsets: tuple  # flat moves after the first and the second segment
 
@@ -79,8 +85,8 @@ def sweep(
 
     def one_axis(axis, own: Ordinates, reads: AxisReads, sums):
         at_elements, in_voxels = sums
-        fields, images = _on_axis(axis, lambda a: _fields(layout, a, surface, medium, inflow is not None))
-        track = _track(layout, axis if isinstance(axis, int) else 0, fields)
+        fields, occupied, images = _on_axis(axis, lambda a: _fields(layout, a, surface, medium, inflow is not None))
+        track = _track(layout, axis if isinstance(axis, int) else 0, fields, occupied)
         hits, probes, passing = _sweep_axis(track, own, reads, images, inflow, fluence)
         at_elements = at_elements.at[:, reads.hits.element].add(hits).at[:, reads.probes.element].add(probes)
         if passing is not None:
@@ -121,6 +127,8 @@ class _Track(NamedTuple):
     """Everything the sweeps along one axis share."""
 
     fields: _Fields
+    occupied: Array  # [K] planes with surfaces other than ghost voxels at their rim
+    rim: np.ndarray  # [P] those ghost voxels
     count: int  # planes
     area: int  # voxels a plane
     width: int
@@ -137,26 +145,53 @@ class _Track(NamedTuple):
     def table(self, own: Ordinates, first: Int[Array, ""] | int) -> Chords:
         return _chord_table(own, first, self.count, self.width, self.wrap_v)
 
+    def cross(self, number: Int[Array, ""], rays, chords: Chords, length, entering, fluence: bool):
+        """Carry rays through plane `number`; see `_cross`."""
+        plane = _row(self.fields, number)
+        through = lambda cut: lambda: _cross(rays, chords, plane, length, entering, self, fluence, cut)
+        return lax.cond(self.occupied[number], through(True), through(False))
+
     def lap(self, own: Ordinates, first: Int[Array, ""] | int, rays: Float[Array, "D C P"]) -> Float[Array, "D C P"]:
         """Carry rays once around a periodic axis."""
         table = self.table(own, first)
 
         def step(k, rays):
-            fields = _row(self.fields, self.plane(own, k))
-            return _cross(rays, _row(table, k), fields, self.length(own), None, self.width, self.wrap_v, False)[1]
+            number = self.plane(own, k)
+            return self.cross(number, rays, _row(table, k), self.length(own), None, False)[1]
 
         return lax.fori_loop(0, self.count, step, rays)
 
 
 def _fields(layout: Layout, axis: int, surface: Float[Array, "C X Y Z"], medium: SweptMedium | None, inflow: bool):
-    """Everything on planes along a sweep axis: the fields, and with `inflow` the image numbers of open ghost voxels."""
+    """Everything on planes along a sweep axis.
+
+    The fields, which planes hold surfaces, and with `inflow` the image numbers of open ghost voxels.
+    """
+    inner = [n - 2 * p for n, p in zip(layout.padded, layout.pad, strict=True)]
+    real_voxel = np.pad(np.ones(inner, bool), [(p, p) for p in layout.pad])
+    surface_voxel = (layout.plane[0] != 1.0) & (real_voxel | _end_planes(layout, axis))
     fields = _Fields(
         geometry=tuple(_planes(layout.plane[row], axis) for row in (0, *(1 + a for a in AXES[axis]))),
         exitance=_planes(surface, axis),
         extinction=None if medium is None else _planes(medium.extinction, axis),
         source=None if medium is None else _planes(medium.source, axis),
+        thin=medium is not None and medium.thin,
     )
-    return fields, _planes(layout.inflow_image, axis) if inflow else None
+    occupied = jnp.any(_planes(surface_voxel, axis), axis=-1)
+    return fields, occupied, _planes(layout.inflow_image, axis) if inflow else None
+
+
+def _end_planes(layout: Layout, axis: int) -> np.ndarray:
+    """The planes of ghost voxels before and behind all others."""
+    number = np.arange(layout.padded[axis])
+    ends = (number < layout.pad[axis]) | (number >= len(number) - layout.pad[axis])
+    return np.expand_dims(ends, [a for a in range(3) if a != axis])
+
+
+def _rim(layout: Layout, axis: int) -> np.ndarray:
+    """The ghost voxels at the rim of a plane, flat."""
+    inside = np.ones([layout.padded[a] - 2 * layout.pad[a] for a in AXES[axis][1:]], bool)
+    return ~np.pad(inside, [(layout.pad[a], layout.pad[a]) for a in AXES[axis][1:]]).ravel()
 
 
 def _from_planes(layout: Layout, axis: int, planes: Float[Array, "K C P"]) -> Float[Array, "C X Y Z"]:
@@ -165,10 +200,11 @@ def _from_planes(layout: Layout, axis: int, planes: Float[Array, "K C P"]) -> Fl
     return field.transpose(0, *(1 + AXES[axis].index(a) for a in range(3)))
 
 
-def _track(layout: Layout, axis: int, fields: _Fields) -> _Track:
+def _track(layout: Layout, axis: int, fields: _Fields, occupied: Array) -> _Track:
     count, height, width = layout.padded_along(axis)
     periodic, wrap_v = layout.pad[axis] == 0, layout.pad[AXES[axis][2]] == 0
-    return _Track(fields, count, height * width, width, periodic, wrap_v, layout.spacing)
+    rim = _rim(layout, axis)
+    return _Track(fields, occupied, rim, count, height * width, width, periodic, wrap_v, layout.spacing)
 
 
 def _sweep_axis(
@@ -189,14 +225,13 @@ def _sweep_axis(
         def plane_step(step, carry):
             rays, (hits, probes, mean) = carry
             number, chords = track.plane(own, step), _row(table, step)
-            plane = _row(track.fields, number)
             entering = None if images is None or radiance_in is None else _entering(_row(images, number), radiance_in)
-            starts, rays, passing = _cross(rays, chords, plane, length, entering, track.width, track.wrap_v, fluence)
+            starts, rays, passing = track.cross(number, rays, chords, length, entering, fluence)
             if passing is not None:
                 row = lax.dynamic_index_in_dim(mean, number, 0, keepdims=False)
                 row = row + jnp.tensordot(own.weight, passing, 1)
                 mean = lax.dynamic_update_index_in_dim(mean, row, number, 0)
-            here = (own, starts, chords, plane, length)
+            here = (own, starts, chords, _row(track.fields, number), length)
             assert own.hit_bits is not None and own.probe_bits is not None  # by mark_hits
             hits = _read(hits, number, reads.hits, own.hit_bits, *here, _mean_of_hits)
             probes = _read(probes, number, reads.probes, ~own.probe_bits, *here, _mean_of_paths)
@@ -241,7 +276,7 @@ def count_laps(
     counted, longest = [], jnp.int32(1)
     for axis, own in enumerate(ordinates):
         if layout.pad[axis] == 0 and own.weight.shape[0]:
-            track = _track(layout, axis, _fields(layout, axis, dark, medium, False)[0])
+            track = _track(layout, axis, *_fields(layout, axis, dark, medium, False)[:2])
             numbers = jnp.arange(own.weight.shape[0])
             laps = lax.map(lambda chunk, track=track, own=own: chunk_laps(track, _chunk(own, chunk)), numbers)
             own, longest = eqx.tree_at(lambda o: o.laps, own, laps), jnp.maximum(longest, laps.max())
@@ -259,7 +294,7 @@ def _row(table, index: Int[Array, ""]):
     return jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, index, 0, keepdims=False), table)
 
 
-class _Fields(NamedTuple):
+class _Fields(eqx.Module):
     """Geometry (offset and normal), exitance, extinction and source of some planes, of one plane, or of voxels of one.
 
     Each is an array of its own: slices of one stacked array keep XLA from vectorising the step (20 times slower).
@@ -269,6 +304,7 @@ class _Fields(NamedTuple):
     exitance: Array
     extinction: Array | None
     source: Array | None
+    thin: bool = eqx.field(static=True)
 
     def cells(self, cells: Int[Array, " T"]) -> _Fields:
         return jax.tree.map(lambda a: a[..., cells], self)
@@ -307,7 +343,7 @@ def _chords(own: Ordinates, step: Int[Array, ""], width: int, wrap_v: bool) -> C
         (point(second, always, always), point(one, always, always)),
     )
     offsets = (jnp.where(u_first, flat_u, flat_v), jnp.where(u_first, flat_v, flat_u))
-    return Chords(ends, (first, second - first, 1 - second), offsets)
+    return Chords(ends, (jnp.broadcast_to(sense, p.shape), p, q), (first, second - first, 1 - second), offsets)
 
 
 def _height(geometry: tuple, point: tuple) -> Float[Array, "D 1 P"]:
@@ -316,20 +352,33 @@ def _height(geometry: tuple, point: tuple) -> Float[Array, "D 1 P"]:
     return geometry[0] + geometry[1] * a + geometry[2] * u + geometry[3] * v
 
 
+class _Plane(NamedTuple):
+    """Voxels and how the rays of each direction fall on their surfaces: n . step, and 1 over its magnitude, [D, 1, P]."""
+
+    fields: _Fields
+    slope: Array
+    steepness: Array
+
+
+def _facing(fields: _Fields, chords: Chords) -> _Plane:
+    slope = _height((0.0, *fields.geometry[1:]), chords.step)
+    return _Plane(fields, slope, 1 / (jnp.abs(slope) + 1e-20))
+
+
 class _Free(NamedTuple):
-    """The free part of a segment: whether it ends on or starts from a surface, and its share of the segment."""
+    """The free part of a segment: whether it starts behind a surface, ends behind one, and its share of the step."""
 
+    behind: Array
     arrives: Array
-    departs: Array
-    part: Array
+    share: Array
 
 
-def _free_part(geometry: tuple, ends: tuple) -> _Free:
-    g0, g1 = _height(geometry, ends[0]), _height(geometry, ends[1])
-    hit = jnp.minimum(g0, g1) < 0
-    falling = g0 > g1
-    part = jnp.clip(jnp.maximum(g0, g1) / jnp.maximum(jnp.abs(g1 - g0), 1e-9), 0.0, 1.0)
-    return _Free(hit & falling, hit & ~falling, jnp.where(hit, part, 1.0))
+def _free_part(plane: _Plane, start: tuple, share: Array) -> _Free:
+    g0 = _height(plane.fields.geometry, start)
+    g1 = g0 + share * plane.slope
+    # Of the way down from the higher end, the free part; all of it where both ends are free, nothing where both are not.
+    free = jnp.minimum(jnp.maximum(g0, g1) * plane.steepness, share)
+    return _Free(g0 < 0, g1 < 0, jnp.maximum(free, 0.0))
 
 
 def _attenuate(radiance, plane: _Fields, length):
@@ -337,33 +386,42 @@ def _attenuate(radiance, plane: _Fields, length):
     if plane.extinction is None or plane.source is None:
         return radiance, radiance
     tau = plane.extinction * length
-    transmittance = jnp.exp(-tau)
-    thin = tau < _THIN
-    series = 1 - tau * (0.5 - tau * (1 / 6 - tau * (1 / 24)))
-    mean = jnp.where(thin, series, (1 - transmittance) / jnp.maximum(tau, _THIN))
+    mean = 1 - tau * (1 / 2 - tau * (1 / 6 - tau * (1 / 24 - tau * (1 / 120 - tau * (1 / 720 - tau * (1 / 5040))))))
     excess = radiance - plane.source
+    if plane.thin:
+        return radiance - tau * (mean * excess), plane.source + mean * excess
+    transmittance = jnp.exp(-tau)
+    limit = thin_limit(tau.dtype)
+    thin = tau < limit
+    mean = jnp.where(thin, mean, (1 - transmittance) / jnp.maximum(tau, limit))
     # The first form keeps the light a thin path adds, the second the light a thick one lets through.
     end = jnp.where(thin, radiance - tau * mean * excess, plane.source + transmittance * excess)
     return end, plane.source + mean * excess
 
 
-def _cross(rays, chords: Chords, plane: _Fields, length, entering, width: int, wrap_v: bool, fluence: bool):
-    """Carry rays [D, C, P] through one plane of voxels; also their radiance before each segment and their path means."""
+def _cross(rays, chords: Chords, fields: _Fields, length, entering, track: _Track, fluence: bool, cut: bool):
+    """Carry rays [D, C, P] through one plane of voxels; also their radiance before each segment and their path means.
+
+    Without `cut` the plane holds no surface but the ghost voxels at its rim.
+    """
     starts, passing = [], None
-    emitted = plane.exitance if entering is None else plane.exitance + entering
+    emitted = fields.exitance if entering is None else fields.exitance + entering
+    plane = _facing(fields, chords) if cut else None
     for number in range(3):
         if number:
             # The barrier keeps XLA from computing the segment again for each reader of the moved rays.
-            rays = lax.optimization_barrier(shift(rays, chords.offsets[number - 1], width, wrap_v))
+            rays = shift(lax.optimization_barrier(rays), chords.offsets[number - 1], track.width, track.wrap_v)
         starts.append(rays)
         share = chords.share[number][:, None, None]
-        free = _free_part(plane.geometry, chords.ends[number])
-        begin = jnp.where(free.departs, emitted, rays)
-        end, mean = _attenuate(begin, plane, length[:, None, None] * share * free.part)
-        rays = jnp.where(free.arrives, emitted, end)
+        if plane is not None:
+            free = _free_part(plane, chords.ends[number][0], share)
+            rays, path = jnp.where(free.behind, emitted, rays), free.share
+        else:
+            free, path = None, share
+        end, mean = _attenuate(rays, fields, length[:, None, None] * path)
+        rays = jnp.where(track.rim if free is None else free.arrives, emitted, end)
         if fluence:
-            inside = mean * (free.part * share)
-            passing = inside if passing is None else passing + inside
+            passing = path * mean if passing is None else passing + path * mean
     return starts, rays, passing
 
 
@@ -414,13 +472,13 @@ def _mean_of_hits(radiance, plane: _Fields, face, chords: Chords, length) -> Flo
 def _mean_of_paths(radiance, plane: _Fields, face, chords: Chords, length) -> Float[Array, "D C T"]:
     """Mean radiance of the free paths in the voxel; 0 where there are none."""
     total = paths = 0.0
+    # Gathered once, not anew for every use.
+    radiance, plane = lax.optimization_barrier((radiance, plane))
+    facing = _facing(plane, chords)
     for number, ends in enumerate(chords.ends):
-        share = chords.share[number][:, None, None]
-        free = _free_part(plane.geometry, ends)
-        begin = jnp.where(free.departs, plane.exitance, radiance[number])
-        _, mean = _attenuate(begin, plane, length * share * free.part)
-        path = share * free.part
-        total, paths = total + path * mean, paths + path
+        free = _free_part(facing, ends[0], chords.share[number][:, None, None])
+        _, mean = _attenuate(jnp.where(free.behind, plane.exitance, radiance[number]), plane, length * free.share)
+        total, paths = total + free.share * mean, paths + free.share
     return jnp.where(paths > 1e-6, total / jnp.maximum(paths, 1e-6), 0.0)
 
 
