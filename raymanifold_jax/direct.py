@@ -24,7 +24,7 @@ from .layout import Layout
 from .march import transmittance
 from .operator import Light, Materials, Transport, make_transport
 from .quadrature import Quadrature
-from .scene import PointLight, Scene, Sky, Sun
+from .scene import OPEN, PointLight, Scene, Sky, Sun, Wall
 from .surfaces import Surfaces, patch_points
 from .trace import visible
 from .transport.characteristic import Inflow
@@ -57,7 +57,7 @@ def first_flight(
         swept = transport(Light(materials.emission, materials.medium_source), sky)
     if (points := small_emitters(scene, surfaces)) is not None:
         # The elements' share of the emitters' light is taken exactly; the sweep's share of it is taken out.
-        exact = emitter_irradiance(scene, points, surfaces.position, surfaces.normal) / jnp.pi
+        exact = _conserved(scene, surfaces, points) / jnp.pi
         if sky is not None or bool(emits.voxels):
             exact = exact + transport(Light(dark.elements, materials.medium_source), sky).elements
         swept = Light(exact, swept.voxels)
@@ -159,17 +159,35 @@ def emitter_irradiance(
     scene: Scene, points: EmitterPoints, position: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]
 ) -> Float[Array, "C n"]:
     """Irradiance at surface points from emitter points, with exact visibility and transmittance."""
+    return _all_pairs(scene, points, position, normal)[0]
+
+
+def _all_pairs(scene: Scene, points: EmitterPoints, position: np.ndarray, normal: np.ndarray) -> Float[Array, "2 C n"]:
     real = points.power.dtype
     block = max(1, _PAIRS // len(points.position))
     count = len(position)
     padded = -(-count // block) * block
     spread = lambda a: jnp.asarray(np.concatenate([a, np.repeat(a[-1:], padded - count, 0)]), real).reshape(-1, block, 3)
     parts = [_pairs(scene, points, p, n) for p, n in zip(spread(position), spread(normal), strict=True)]
-    return jnp.concatenate(parts, axis=1)[:, :count]
+    return jnp.concatenate(parts, axis=-1)[..., :count]
+
+
+def _conserved(scene: Scene, surfaces: Surfaces, points: EmitterPoints) -> Float[Array, "C E"]:
+    """Irradiance of the elements from emitter points, scaled so that all the power sent arrives (by about 0.2 % at 16^3).
+
+    Elements are read at their middles, which counts a little too much where the light is near.
+    """
+    found = _all_pairs(scene, points, surfaces.position, surfaces.normal)
+    if not all(side is OPEN or isinstance(side, Wall) for side in scene.boundary.sides):
+        return found[0]  # some of it leaves through mirrors and periodic sides
+    sent = jnp.pi * jnp.sum(points.power, axis=1)
+    received = found[1] @ jnp.asarray(surfaces.area, sent.dtype)
+    return found[0] * jnp.where(received > 0, jnp.clip(sent / jnp.maximum(received, 1e-30), 0.95, 1.05), 1.0)[:, None]
 
 
 @eqx.filter_jit
-def _pairs(scene: Scene, points: EmitterPoints, position, normal) -> Float[Array, "C n"]:
+def _pairs(scene: Scene, points: EmitterPoints, position, normal) -> Float[Array, "2 C n"]:
+    """The irradiance, and what it would be without a medium."""
     real = position.dtype
     clearance = 2e-3 * scene.lattice.spacing
     start = position + clearance * normal
@@ -182,8 +200,11 @@ def _pairs(scene: Scene, points: EmitterPoints, position, normal) -> Float[Array
     geometry = jnp.maximum(leaving, 0.0) * jnp.maximum(arriving, 0.0) / squared**2
     starts = jnp.broadcast_to(start[:, None], to.shape).reshape(-1, 3)
     ends = jnp.broadcast_to((end + clearance * towards)[None], to.shape).reshape(-1, 3)
-    passed = geometry.reshape(-1) * visible(scene, starts, ends) * transmittance(scene, starts, ends)
-    return jnp.einsum("cnm,cm->cn", passed.reshape(-1, *geometry.shape), points.power)
+    seen = geometry.reshape(-1) * visible(scene, starts, ends)
+    passed = seen * transmittance(scene, starts, ends)
+    irradiance = jnp.einsum("cnm,cm->cn", passed.reshape(-1, *geometry.shape), points.power)
+    unattenuated = jnp.einsum("nm,cm->cn", seen.reshape(geometry.shape), points.power)
+    return jnp.stack([irradiance, unattenuated])
 
 
 def _from_point(scene: Scene, surfaces: Surfaces, light: PointLight) -> Light:

@@ -54,7 +54,7 @@ class System(eqx.Module):
     def bounce(self, leaving: Light) -> tuple[Light, Light]:
         """The light that arrives, of what leaves; and what of it leaves again."""
         arriving = self.transport(leaving, fluence=self.scatters)
-        return arriving, self.materials.reflected(arriving)
+        return arriving, _reflected(self.materials, arriving)
 
     def nothing(self) -> Light:
         """No arriving light."""
@@ -73,20 +73,20 @@ class Certificate:
 def certify(system: System) -> Certificate:
     """Find w by applying K to 1 until what is left everywhere is surely less than 1."""
     total = jax.tree.map(jnp.ones_like, system.materials.reflected(system.source))
-    power = _bounce(system, total)[1]
+    power = system.bounce(total)[1]
     row_sum = min(float(power.largest()), 1.0)
     count = 1
     # Where rows add up to well below 1 this loop does nothing.
     while float(power.largest()) > _CERTAIN and count < _POWERS:
         total = total + power
-        power, count = _bounce(system, power)[1], count + 1
+        power, count = system.bounce(power)[1], count + 1
     left = float(power.largest())
     return Certificate(row_sum * float(total.largest()) / (1 - left) if left < 1 - 1e-6 else math.inf, count)
 
 
 @eqx.filter_jit
-def _bounce(system: System, leaving: Light) -> tuple[Light, Light]:
-    return system.bounce(leaving)
+def _reflected(stuff: Materials, arriving: Light) -> Light:
+    return stuff.reflected(arriving)
 
 
 class Iteration:
@@ -140,7 +140,7 @@ class Jacobi(eqx.Module):
     def run(self, iteration: Iteration) -> None:
         lost = iteration.arriving
         while not iteration.over:
-            order, iteration.residual = _bounce(iteration.system, iteration.residual)
+            order, iteration.residual = iteration.system.bounce(iteration.residual)
             iteration.arriving, lost = _add(iteration.arriving, lost, order)
             iteration.note(float(iteration.residual.largest()), float(_largest(iteration.system, iteration.arriving)))
 
@@ -171,7 +171,7 @@ class Krylov(eqx.Module):
         orders = [none] * self.restart
         hessenberg = np.zeros((self.restart + 1, self.restart))
         for step in range(self.restart):
-            orders[step], leaving = _bounce(system, basis[step])
+            orders[step], leaving = system.bounce(basis[step])
             basis[step + 1], column = _arnoldi(tuple(basis), basis[step], leaving)
             hessenberg[:, step] = np.asarray(column)[: self.restart + 1]
             hessenberg[step + 1, step] = float(column[-1])

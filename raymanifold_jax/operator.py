@@ -13,7 +13,10 @@ Public: `Light`, `Transport`, `make_transport`, `Materials`, `materials`.
 
 from __future__ import annotations
 
+import dataclasses
+
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -23,8 +26,10 @@ from .quadrature import Quadrature
 from .scene import Scene, Wall
 from .surfaces import Surfaces
 from .transport.characteristic import Inflow, SweptMedium, count_laps, mark_hits, sweep, thin_limit
+from .transport.transpose import transposed_sweep
 
 _MOST_LAPS = 1 << 16
+_ROUNDS = 1  # of Sinkhorn's iteration; each halves what bias is left, or better, and costs about four sweeps
 _TRACE = 1e-7  # optical depth a voxel
 
 
@@ -101,22 +106,78 @@ class Transport(eqx.Module):
     layout: Layout
     ordinates: tuple[Ordinates, ...]
     extinction: Float[Array, "C X Y Z"] | None
-    element_sums: Float[Array, " E"]
-    voxel_sums: Float[Array, "nx ny nz"]
+    element_sums: Float[Array, "C E"]
+    voxel_sums: Float[Array, "C nx ny nz"]
+    coverage: Float[Array, "nx ny nz"]  # weights of the paths through each voxel; 0 inside solids
     thin: bool = eqx.field(static=True)
+    factors: Light | None = None  # what leaves is multiplied by, for the exchange of power to balance
 
-    @eqx.filter_jit
     def __call__(self, leaving: Light, inflow: Inflow | None = None, fluence: bool = True) -> Light:
         """Mean radiance arriving at elements and in voxels, of what leaves them and of what comes in through open sides."""
+        leaving, inflow = _balanced(self.factors, leaving, inflow)
         sums = _sweep(self.layout, self.ordinates, self.extinction, self.thin, leaving, inflow, fluence)
-        elements = _ratio(sums.elements, self.element_sums)
-        return Light(elements, None if sums.voxels is None else _ratio(sums.voxels, self.voxel_sums))
+        return _means(sums, Light(self.element_sums, self.voxel_sums))
 
 
+@eqx.filter_jit
+def _balanced(factors: Light | None, leaving: Light, inflow: Inflow | None) -> tuple[Light, Inflow | None]:
+    if factors is None:
+        return leaving, inflow
+    voxels = None if leaving.voxels is None or factors.voxels is None else leaving.voxels * factors.voxels
+    leaving = Light(leaving.elements * factors.elements, voxels)
+    return leaving, None if inflow is None else Inflow(inflow.radiance, factors.elements)
+
+
+@eqx.filter_jit
+def _means(sums: Light, furnace: Light) -> Light:
+    elements = _ratio(sums.elements, furnace.elements)
+    return Light(elements, None if sums.voxels is None else _ratio(sums.voxels, furnace.voxels))
+
+
+def _balance(transport: Transport, area: Float[Array, " E"]) -> Transport:
+    """The same transport with factors of what leaves that make the exchange of power balance.
+
+    The power that a source sends should all arrive: with g = (pi A, 4 pi extinction V), the power at an element or in a
+    voxel for a mean radiance of 1, the columns of K without albedos add up as sum_i g_i K_ij = g_j. Gathering makes the rows
+    exact, not the columns, which are some percent off next to concave corners. Sinkhorn's iteration scales both in turn: the
+    transposed sweep tells the columns' sums, the furnace the rows'.
+    """
+    layout, extinction = transport.layout, transport.extinction
+    images = len(layout.unfolding.images())
+    power = Light(jnp.broadcast_to(jnp.pi * area, transport.element_sums.shape))
+    sums = Light(transport.element_sums)
+    if extinction is not None:
+        weight = sum(jnp.sum(o.weight) for o in transport.ordinates)
+        volume = transport.coverage * (4 * jnp.pi / weight * layout.spacing**3 / images)
+        power = Light(power.elements, layout.from_padded(extinction) / images * volume)
+        sums = Light(sums.elements, transport.voxel_sums)
+    factors = Light(jnp.ones_like(power.elements))
+    for _ in range(_ROUNDS):
+        sent = _transposed(layout, transport.ordinates, extinction, transport.thin, jax.tree.map(_ratio, power, sums))
+        factors = jax.tree.map(_factor, power, sent)
+        swept = _furnace(transport, factors)
+        sums = Light(swept.elements, None if power.voxels is None else swept.voxels)
+    return dataclasses.replace(transport, element_sums=swept.elements, voxel_sums=swept.voxels, factors=factors)
+
+
+@jax.jit
+def _factor(wanted: Array, sent: Array) -> Array:
+    return jnp.clip(jnp.where(sent > 0, wanted / jnp.where(sent > 0, sent, 1.0), 1.0), 0.5, 2.0)
+
+
+@eqx.filter_jit
+def _transposed(layout: Layout, ordinates, extinction, thin: bool, asked: Light) -> Light:
+    medium = None if extinction is None else SweptMedium(extinction, jnp.zeros_like(extinction), thin)
+    return Light(*transposed_sweep(layout, ordinates, asked.elements, asked.voxels, medium))
+
+
+@jax.jit
 def _ratio(sums: Array, furnace: Array) -> Array:
     return jnp.where(furnace > 0, sums / jnp.where(furnace > 0, furnace, 1.0), 0.0)
 
 
+# A program of its own: furnaces, bounces and first flights of one shape share it.
+@eqx.filter_jit
 def _sweep(layout, ordinates, extinction, thin, leaving: Light, inflow: Inflow | None, fluence: bool) -> Light:
     medium = None
     if extinction is not None:
@@ -125,16 +186,14 @@ def _sweep(layout, ordinates, extinction, thin, leaving: Light, inflow: Inflow |
     return Light(*sweep(layout, ordinates, leaving.elements, medium, inflow, fluence))
 
 
-@eqx.filter_jit
-def _furnace(layout: Layout, ordinates, extinction, thin: bool) -> tuple[tuple, Array, Array]:
-    """Mark the hits, and sweep a uniform radiance of 1: the sums at elements and, outside solids, in voxels."""
-    ordinates = mark_hits(layout, ordinates)
-    first = None if extinction is None else extinction[:1]
-    voxels = None if first is None else jnp.ones((1, *layout.shape), first.dtype)
-    leaving = Light(jnp.ones((1, layout.elements), layout.plane.dtype), voxels)
-    sums = _sweep(layout, ordinates, first, thin, leaving, None, True)
+_mark_hits = eqx.filter_jit(mark_hits)
+
+
+def _furnace(transport: Transport, leaving: Light) -> Light:
+    """The sums at elements and, outside solids, in voxels for light of 1, or in proportion to it."""
+    sums = _sweep(transport.layout, transport.ordinates, transport.extinction, transport.thin, leaving, None, True)
     assert sums.voxels is not None
-    return ordinates, sums.elements[0], jnp.where(_solid(layout), 0.0, sums.voxels[0])
+    return Light(sums.elements, jnp.where(_solid(transport.layout), 0.0, sums.voxels))
 
 
 def _solid(layout: Layout) -> Array:
@@ -147,6 +206,7 @@ def make_transport(
     extinction: Float[Array, "C nx ny nz"] | None,
     bands: int,
     mirrored: bool = True,
+    area: Float[np.ndarray, " E"] | None = None,
 ) -> Transport:
     """Prepare the sweeps of one set of directions over a layout.
 
@@ -167,5 +227,10 @@ def make_transport(
                 f"boundary: some rays are still going after {_MOST_LAPS} laps of a periodic axis; expected every ray to meet "
                 "a surface, an open side or an absorbing medium; close or open another side, or add absorption"
             )
-    ordinates, element_sums, voxel_sums = _furnace(layout, ordinates, padded, thin)
-    return Transport(layout, ordinates, padded, element_sums, voxel_sums, thin)
+    ones = lambda *shape: jnp.ones((bands, *shape), layout.plane.dtype)
+    transport = Transport(layout, _mark_hits(layout, ordinates), padded, ones(), ones(), ones(), thin)
+    sums = _furnace(transport, Light(ones(layout.elements), None if extinction is None else ones(*layout.shape)))
+    assert sums.voxels is not None
+    fields = {"element_sums": sums.elements, "voxel_sums": sums.voxels, "coverage": sums.voxels[0]}
+    transport = dataclasses.replace(transport, **fields)
+    return transport if area is None else _balance(transport, jnp.asarray(area, layout.plane.dtype))

@@ -66,7 +66,7 @@ def solve(
         surfaces = find_surfaces(scene)
         stuff = materials(scene, surfaces)
         layout = make_layout(scene, surfaces)
-        transport = make_transport(layout, quadrature, stuff.extinction, scene.bands)
+        transport = make_transport(layout, quadrature, stuff.extinction, scene.bands, area=surfaces.area)
         system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff))
         iteration = Iteration(system, certify(system), float(rtol), max_sweeps, meter)
         (Krylov() if isinstance(solver, str) else solver).run(iteration)
@@ -106,7 +106,7 @@ def _finish(scene: Scene, surfaces: Surfaces, quadrature: Quadrature, iteration:
         bounced = Light(bounced.elements, everywhere.voxels)
     rest = system.direct.rest + bounced
     outside = jnp.asarray(~surfaces.solid)
-    free = jnp.where(outside, system.transport.voxel_sums / _whole(system.transport), 0.0)
+    free = jnp.where(outside, system.transport.coverage / _whole(system.transport), 0.0)
     fluence = lambda light: jnp.where(outside, 4 * jnp.pi * light.voxels, 0.0)
     fields = {
         "diffuse_irradiance": jnp.pi * rest.elements,

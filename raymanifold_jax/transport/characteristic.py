@@ -16,6 +16,7 @@ Public: `Characteristic`, `sweep`, `SweptMedium`, `Inflow`, `mark_hits`, `count_
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -55,6 +56,7 @@ class Inflow(eqx.Module):
     """Radiance entering open sides: by mirror image of the side and direction of the quadrature."""
 
     radiance: Float[Array, "images n C"]
+    factor: Float[Array, "C E"] | None = None  # to be multiplied by, at each open element
 
 
 class Chords(NamedTuple):
@@ -82,12 +84,14 @@ def sweep(
     """
     bands = exitance.shape[0]
     surface = layout.exitance_field(exitance)
+    factor = None if inflow is None or inflow.factor is None else layout.exitance_field(inflow.factor)
 
     def one_axis(axis, own: Ordinates, reads: AxisReads, sums):
         at_elements, in_voxels = sums
         fields, occupied, images = _on_axis(axis, lambda a: _fields(layout, a, surface, medium, inflow is not None))
         track = _track(layout, axis if isinstance(axis, int) else 0, fields, occupied)
-        hits, probes, passing = _sweep_axis(track, own, reads, images, inflow, fluence)
+        strength = None if factor is None else _on_axis(axis, lambda a, field=factor: _planes(field, a))
+        hits, probes, passing = _sweep_axis(track, own, reads, images, inflow, strength, fluence)
         at_elements = at_elements.at[:, reads.hits.element].add(hits).at[:, reads.probes.element].add(probes)
         if passing is not None:
             in_voxels = in_voxels + _on_axis(axis, lambda a: _from_planes(layout, a, passing))
@@ -145,19 +149,20 @@ class _Track(NamedTuple):
     def table(self, own: Ordinates, first: Int[Array, ""] | int) -> Chords:
         return _chord_table(own, first, self.count, self.width, self.wrap_v)
 
-    def cross(self, number: Int[Array, ""], rays, chords: Chords, length, entering, fluence: bool):
-        """Carry rays through plane `number`; see `_cross`."""
+    def cross(self, number: Int[Array, ""], rays, chords: Chords, length, entering, fluence: bool, sent=None):
+        """Carry rays through plane `number`, of its own light or of what is `sent` instead; see `_cross`."""
         plane = _row(self.fields, number)
+        plane = plane if sent is None else plane.sending(sent)
         through = lambda cut: lambda: _cross(rays, chords, plane, length, entering, self, fluence, cut)
         return lax.cond(self.occupied[number], through(True), through(False))
 
-    def lap(self, own: Ordinates, first: Int[Array, ""] | int, rays: Float[Array, "D C P"]) -> Float[Array, "D C P"]:
-        """Carry rays once around a periodic axis."""
+    def lap(self, own: Ordinates, first: Int[Array, ""] | int, rays: Float[Array, "D C P"], entering) -> Float[Array, "D C P"]:
+        """Carry rays once around a periodic axis; `entering(plane)` is what its open ghost voxels send in."""
         table = self.table(own, first)
 
         def step(k, rays):
             number = self.plane(own, k)
-            return self.cross(number, rays, _row(table, k), self.length(own), None, False)[1]
+            return self.cross(number, rays, _row(table, k), self.length(own), entering(number), False)[1]
 
         return lax.fori_loop(0, self.count, step, rays)
 
@@ -213,6 +218,7 @@ def _sweep_axis(
     reads: AxisReads,
     images: Int[Array, "K P"] | None,
     inflow: Inflow | None,
+    strength: Float[Array, "K C P"] | None,
     fluence: bool,
 ) -> tuple[Float[Array, "C M"], Float[Array, "C M2"], Float[Array, "K C P"] | None]:
     bands, real = track.fields.exitance.shape[1], track.fields.exitance.dtype
@@ -222,11 +228,16 @@ def _sweep_axis(
         radiance_in = None if inflow is None else inflow.radiance[:, own.index]
         table, length = track.table(own, 0), track.length(own)
 
+        def entering(number):
+            if images is None or radiance_in is None:
+                return None
+            radiance = _entering(_row(images, number), radiance_in)
+            return radiance if strength is None else radiance * _row(strength, number)
+
         def plane_step(step, carry):
             rays, (hits, probes, mean) = carry
             number, chords = track.plane(own, step), _row(table, step)
-            entering = None if images is None or radiance_in is None else _entering(_row(images, number), radiance_in)
-            starts, rays, passing = track.cross(number, rays, chords, length, entering, fluence)
+            starts, rays, passing = track.cross(number, rays, chords, length, entering(number), fluence)
             if passing is not None:
                 row = lax.dynamic_index_in_dim(mean, number, 0, keepdims=False)
                 row = row + jnp.tensordot(own.weight, passing, 1)
@@ -240,7 +251,7 @@ def _sweep_axis(
         rays = jnp.zeros((own.weight.shape[0], bands, track.area), real)
         if track.periodic:  # enough laps that what entered at the first no longer matters
             first = lambda number: (number - own.laps + 1) * track.count
-            rays = lax.fori_loop(0, own.laps - 1, lambda number, r: track.lap(own, first(number), r), rays)
+            rays = lax.fori_loop(0, own.laps - 1, lambda number, r: track.lap(own, first(number), r, entering), rays)
         return lax.fori_loop(0, track.count, plane_step, (rays, totals))[1]
 
     totals = (
@@ -267,7 +278,7 @@ def count_laps(
     def chunk_laps(track: _Track, own: Ordinates):
         def lap(state):
             number, rays = state
-            return number + 1, track.lap(own, number * track.count, rays)
+            return number + 1, track.lap(own, number * track.count, rays, lambda _: None)
 
         rays = jnp.where(own.weight[:, None, None] > 0, jnp.ones((1, bands, track.area), dark.dtype), 0.0)
         more = lambda state: (state[0] < most) & (jnp.max(state[1]) > 1e-6)
@@ -308,6 +319,15 @@ class _Fields(eqx.Module):
 
     def cells(self, cells: Int[Array, " T"]) -> _Fields:
         return jax.tree.map(lambda a: a[..., cells], self)
+
+    @property
+    def sent(self) -> tuple[Array, ...]:
+        """What a sweep is linear in: the exitance and, with a medium, the source."""
+        return (self.exitance,) if self.source is None else (self.exitance, self.source)
+
+    def sending(self, sent: tuple[Array, ...]) -> _Fields:
+        """The same geometry and extinction with other light."""
+        return dataclasses.replace(self, exitance=sent[0], source=None if self.source is None else sent[1])
 
 
 def _chords(own: Ordinates, step: Int[Array, ""], width: int, wrap_v: bool) -> Chords:
@@ -433,21 +453,38 @@ def _entering(image: Int[Array, " P"], radiance: Float[Array, "images D C"]) -> 
     return total
 
 
-def _read(sums, plane_number, reads: Reads, bits, own: Ordinates, starts, chords: Chords, plane: _Fields, length, mean_of):
-    """Add weight * cosine * radiance for the elements that read voxels of this plane, in the directions of `bits`."""
-    tile = reads.tile
-    word, bit = np.divmod(np.arange(own.weight.shape[0]), 32)
+class _TileRead(NamedTuple):
+    """One tile of elements that read voxels of a plane: which voxels, and what they read as a function of the light there."""
 
-    def one(number, sums):
-        start = number * tile
-        cut = lambda a: lax.dynamic_slice_in_dim(a, start, tile, axis=-1)
-        cell, face = cut(reads.cell), tuple(cut(component) for component in reads.plane)
-        radiance = [ray[:, :, cell] for ray in starts]
-        value = mean_of(radiance, plane.cells(cell), face, chords, length[:, None, None])
-        chosen = ((cut(bits)[word] >> bit[:, None].astype(np.uint32)) & 1).astype(value.dtype)
-        weight = own.weight[:, None] * jnp.maximum(-_along(own.direction, face), 0.0) * chosen
-        total = jnp.sum(weight[:, None] * value, axis=0)
-        return lax.dynamic_update_slice_in_dim(sums, cut(sums) + total, start, axis=-1)
+    cell: Int[Array, " T"]
+    value: Callable  # (rays before each of three segments [D, C, T], (exitance, source) [C, T]) -> [C, T]
+
+
+def _read_tile(tile, reads: Reads, bits, own: Ordinates, chords: Chords, plane: _Fields, length, mean_of) -> _TileRead:
+    """Weight * cosine * radiance of the elements of a tile, in the directions of `bits`."""
+    cut = lambda a: lax.dynamic_slice_in_dim(a, tile * reads.tile, reads.tile, axis=-1)
+    cell, face = cut(reads.cell), tuple(cut(component) for component in reads.plane)
+    word, bit = np.divmod(np.arange(own.weight.shape[0]), 32)
+    chosen = ((cut(bits)[word] >> bit[:, None].astype(np.uint32)) & 1).astype(length.dtype)
+    weight = own.weight[:, None] * jnp.maximum(-_along(own.direction, face), 0.0) * chosen
+    voxels = plane.cells(cell)
+
+    def value(radiance, sent):
+        mean = mean_of(radiance, voxels.sending(sent), face, chords, length[:, None, None])
+        return jnp.sum(weight[:, None] * mean, axis=0)
+
+    return _TileRead(cell, value)
+
+
+def _read(sums, plane_number, reads: Reads, bits, own: Ordinates, starts, chords: Chords, plane: _Fields, length, mean_of):
+    """Add what the elements that read voxels of this plane get."""
+
+    def one(tile, sums):
+        read = _read_tile(tile, reads, bits, own, chords, plane, length, mean_of)
+        total = read.value(tuple(ray[:, :, read.cell] for ray in starts), plane.cells(read.cell).sent)
+        start = tile * reads.tile
+        total = total + lax.dynamic_slice_in_dim(sums, start, reads.tile, axis=-1)
+        return lax.dynamic_update_slice_in_dim(sums, total, start, axis=-1)
 
     return lax.fori_loop(reads.first_tile[plane_number], reads.first_tile[plane_number + 1], one, sums)
 
