@@ -4,9 +4,9 @@ An error is (ours - expected) / scale, where `scale` is the expected value itsel
 its errors to (an incident flux, 1). The reference's own standard error, on the same scale, says how far one can look.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -68,12 +68,15 @@ class Target(NamedTuple):
         return all(limit is None or value <= limit for limit, value in zip(self, measured, strict=True))
 
 
+Reader: TypeAlias = Callable[[rm.Solution], dict[str, Readings]]
+
+
 @dataclass(frozen=True)
 class Case:
     """A problem with known answers.
 
     - `build(n)`: the scene with n voxels along its longest side (what else n has to be, `build` says in its error).
-    - `read(solution)`: by the name of a quantity, the readings.
+    - `readers`: by name, functions that take a solution to readings by the name of a quantity; each is timed by itself.
     - `sizes`: from quick to the size that the targets are meant for.
     - `targets(n)`: by the name of a quantity.
     - `errors_of`: what errors are shares of, in words.
@@ -83,12 +86,16 @@ class Case:
     name: str
     title: str
     build: Callable[[int], rm.Scene]
-    read: Callable[[rm.Solution], dict[str, Readings]]
+    readers: Mapping[str, Reader]
     sizes: tuple[int, ...]
     targets: Callable[[int], dict[str, Target]] = field(default=lambda n: {})
     errors_of: str = "the value"
     rtol: float = 1e-4
     directions: int = 200
+
+    def read(self, solution: rm.Solution) -> dict[str, Readings]:
+        """The readings of all readers."""
+        return {name: values for reader in self.readers.values() for name, values in reader(solution).items()}
 
 
 def same(**targets: Target) -> Callable[[int], dict[str, Target]]:

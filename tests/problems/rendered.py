@@ -6,7 +6,7 @@ import numpy as np
 
 import raymanifold_jax as rm
 
-from .case import Case, Readings, Target, joined, readings
+from .case import Case, Reader, Readings, Target, joined, readings
 from .data import columns, probes, top_view
 
 _BLOCKS = 32  # a side of the picture
@@ -39,8 +39,8 @@ def read_top_view(name: str, solution: rm.Solution, pixels: int = 256, samples: 
     return {"top view": readings(ours, *top_view(name))}
 
 
-def _read(name: str, solution: rm.Solution) -> dict[str, Readings]:
-    return read_probes(name, solution) | read_top_view(name, solution)
+def _readers(name: str) -> dict[str, Reader]:
+    return {"probes": partial(read_probes, name), "top view": partial(read_top_view, name)}
 
 
 def _room_targets(n: int) -> dict[str, Target]:
@@ -53,6 +53,6 @@ def _fog_targets(n: int) -> dict[str, Target]:
 
 
 CASES = (
-    Case("room", "scene A, a closed room", rm.scenes.room, partial(_read, "A"), (16, 32, 64), _room_targets),
-    Case("fog", "scene C, three balls in fog", rm.scenes.three_balls_in_fog, partial(_read, "C"), (16, 32, 64), _fog_targets),
+    Case("room", "scene A, a closed room", rm.scenes.room, _readers("A"), (16, 32, 64), _room_targets),
+    Case("fog", "scene C, three balls in fog", rm.scenes.three_balls_in_fog, _readers("C"), (16, 32, 64), _fog_targets),
 )
