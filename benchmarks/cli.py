@@ -44,7 +44,7 @@ def _at_least(least: int) -> click.IntRange:
     return click.IntRange(min=least)
 
 
-_quick = click.option("--quick", is_flag=True, help="Small sizes and few directions: a minute or two, not the figures to quote.")
+_quick = click.option("--quick", is_flag=True, help="Small sizes and few directions: not the figures to quote.")
 _only = click.option("--only", type=_Problem(), multiple=True, metavar="NAME", help="This problem; may be repeated.")
 _json = click.option("--json", "json_file", type=_NewFile(), metavar="FILE", help="Write the record there.")
 _repeats = click.option("--repeats", type=_at_least(0), default=1, show_default=True, help="Timed solves after the first.")
@@ -86,7 +86,7 @@ def accuracy(
     from .table import accuracy_table
 
     _check_quadrature(quadrature)
-    if sizes and (quick or all_sizes) or quick and all_sizes:
+    if sum(map(bool, (sizes, quick, all_sizes))) > 1:
         raise click.UsageError("--quick, --all-sizes and --size exclude one another; keep one of them")
     jobs = []
     for name in only or problems.CASES:

@@ -34,8 +34,12 @@ def accuracy_table(records: Iterable[dict[str, Any]]) -> str:
             rows.append((name, quantity, *about, *figures, _target(errors["target"]), met))
     widths = [max(len(row[i]) for row in rows if not row[1].startswith("failed")) for i in range(len(rows[0]))]
     left = {0, 1, 12, 13}
-    line = lambda row: "  ".join(c.ljust(w) if i in left else c.rjust(w) for i, (c, w) in enumerate(zip(row, widths, strict=True)))
-    return "\n".join(line(row).rstrip() for row in rows)
+
+    def line(row: tuple[str, ...]) -> str:
+        cells = enumerate(zip(row, widths, strict=True))
+        return "  ".join(c.ljust(w) if i in left else c.rjust(w) for i, (c, w) in cells).rstrip()
+
+    return "\n".join(map(line, rows))
 
 
 def seconds_text(seconds: float | None) -> str:

@@ -14,5 +14,6 @@ from .case import readings as readings
 from .closed_form import *  # noqa: F403
 from .data import probes as probes
 from .data import table as table
+from .data import top_view as top_view
 
 CASES = MappingProxyType({case.name: case for case in (*media.CASES, *enclosures.CASES, *rendered.CASES)})

@@ -93,7 +93,7 @@ _MARGIN = 0.2  # around discs of radius 1
 
 
 def discs(gap: int, n: int) -> rm.Scene:
-    """Two black coaxial discs of radius 1, the lower one of exitance 1, let into black planes; open sides; n voxels along 2.4."""
+    """Black coaxial discs of radius 1, the lower one of exitance 1, let into black planes; sides open; n voxels along 2.4."""
     _check_multiple(n, 12)
     side = 2 * (1 + _MARGIN)
     middle = side / 2
@@ -125,7 +125,7 @@ def _read_sphere_to_disc(solution: rm.Solution) -> dict[str, Readings]:
 
 
 def sphere_and_rectangle(n: int) -> rm.Scene:
-    """A black sphere of power 1 and radius 0.3, centre at (0.5, 0.5, 0.5), over a black floor, n voxels along 3; open elsewhere.
+    """A black sphere of power 1 and radius 0.3 at (0.5, 0.5, 0.5), over a black floor, n voxels along 3; open elsewhere.
 
     The rectangle is [0.5, 1.5] x [0.5, 2.5] on the floor.
     """
@@ -153,7 +153,7 @@ _SPHERE_ALBEDO = 0.9
 
 
 def integrating_sphere(port: float, n: int) -> rm.Scene:
-    """A spherical cavity of albedo 0.9 with a black port, the cap that is this share of its area; a point light of intensity 1."""
+    """A spherical cavity of albedo 0.9, of which a cap, this share of its area, is black; a point light of intensity 1."""
     light = [rm.PointLight(_LAMP, 1.0)]
     if port == 0:
         return rm.Scene(cube(n), [rm.Solid(SPHERICAL_CAVITY, _SPHERE_ALBEDO)], lights=light)
@@ -204,7 +204,8 @@ def _read_plates(expected: float, solution: rm.Solution) -> dict[str, Readings]:
     """Net flux: radiosity less irradiance of the floor's elements."""
     surfaces = solution.surfaces
     floor = np.asarray(surfaces.normals)[:, 2] > 0
-    return {"net flux": readings(np.asarray(surfaces.radiosity, float)[floor] - np.asarray(surfaces.irradiance)[floor], expected)}
+    net = np.asarray(surfaces.radiosity, float) - np.asarray(surfaces.irradiance)
+    return {"net flux": readings(net[floor], expected)}
 
 
 def _read_wall_radiance(expected: float, solution: rm.Solution) -> dict[str, Readings]:

@@ -124,7 +124,7 @@ def _read_crosbie_schrenker(solution: rm.Solution) -> dict[str, Readings]:
 
 
 def layers(name: str, n: int, width: int = 1) -> rm.Scene:
-    """DISORT's layers (optical thicknesses and scattering albedos by layer) under a diffuse sky, vacuum below; n voxels high."""
+    """DISORT's layers (their optical thicknesses and scattering albedos) under a diffuse sky, vacuum below; n voxels high."""
     thickness, albedo, radiance = _layers(name)
     depth = sum(thickness)
     step = _step(thickness)
