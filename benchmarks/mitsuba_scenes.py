@@ -18,7 +18,8 @@ from typing import Any
 import numpy as np
 
 _BLOCKS = 32
-_PROBE_SAMPLES, _PIXEL_SAMPLES = 512, 64  # a pass: small, so that the time to an error is resolved
+# Samples of a probe and of a pixel in a pass: few, so that the time to an error is resolved, but enough for full speed.
+_SAMPLES = {"A": (512, 64), "C": (4096, 1024)}
 _PASSES = 100_000
 _OFF = 5e-5
 
@@ -129,7 +130,7 @@ def error_curve(scene: str, quantity: str, seconds: float, goal: float) -> dict[
     else:
         rows = problems.probes(scene)["probes"]
         expected, error = (np.array([row[key] for row in rows]) for key in ("irradiance", "irradiance_se"))
-        render = _probes(mi, loaded, rows)
+        render = _probes(mi, loaded, rows, _SAMPLES[scene][0])
     reference = float(np.sqrt(np.mean((error / expected) ** 2)))
     first, _ = _timed(lambda: render(_PASSES))
     total, spent, points = np.zeros_like(expected), 0.0, []
@@ -158,11 +159,12 @@ def error_curve(scene: str, quantity: str, seconds: float, goal: float) -> dict[
 
 def _top_view(mi: Any, scene: Any, name: str) -> Callable[[int], np.ndarray]:
     sensor = mi.load_dict(_sensor(mi, 1 - 1e-3 if name == "A" else 1.5))
+    samples = _SAMPLES[name][1]
     # Its x axis runs the other way.
-    return lambda seed: np.array(mi.render(scene, sensor=sensor, spp=_PIXEL_SAMPLES, seed=seed), float)[:, ::-1, 0]
+    return lambda seed: np.array(mi.render(scene, sensor=sensor, spp=samples, seed=seed), float)[:, ::-1, 0]
 
 
-def _probes(mi: Any, scene: Any, rows: list[dict[str, Any]]) -> Callable[[int], np.ndarray]:
+def _probes(mi: Any, scene: Any, rows: list[dict[str, Any]], samples: int) -> Callable[[int], np.ndarray]:
     """E = pi (L - L_emitted) / albedo, L along rays that look at the probes from close by."""
     if mi.variant().startswith("scalar"):
         raise RuntimeError("mitsuba: got a scalar variant, expected llvm_ad_mono for single probes; install LLVM 19 or newer")
@@ -170,15 +172,15 @@ def _probes(mi: Any, scene: Any, rows: list[dict[str, Any]]) -> Callable[[int], 
     normal = np.array([row["normal"] for row in rows])
     albedo = np.array([row["albedo"] for row in rows])
     emitted = np.array([row["emitted_radiance"] for row in rows])
-    spread = lambda values: mi.Vector3f(*np.repeat(values, _PROBE_SAMPLES, 0).T.astype(np.float32))
+    spread = lambda values: mi.Vector3f(*np.repeat(values, samples, 0).T.astype(np.float32))
     ray = mi.Ray3f(mi.Point3f(spread(position + _OFF * normal)), spread(-normal))
     sampler = mi.load_dict({"type": "independent"})
     medium = next((shape.interior_medium() for shape in scene.shapes() if shape.interior_medium() is not None), None)
 
     def render(seed: int) -> np.ndarray:
-        sampler.seed(seed, len(rows) * _PROBE_SAMPLES)
+        sampler.seed(seed, len(rows) * samples)
         radiance = scene.integrator().sample(scene, sampler, ray, medium)[0]
-        mean = np.array(radiance, float).reshape(len(rows), _PROBE_SAMPLES).mean(1)
+        mean = np.array(radiance, float).reshape(len(rows), samples).mean(1)
         return np.pi * (mean - emitted) / albedo
 
     return render
