@@ -4,16 +4,14 @@ The closed form and its source stand in the docstrings. Lengths are in units of 
 the radiance that makes a surface's own exitance 1.
 """
 
-import csv
-import json
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 import raymanifold_jax as rm
 
-DATA = Path(__file__).parent / "data"
+from .data import table
+
 UNIT_EXITANCE = 1 / np.pi
 
 
@@ -22,18 +20,6 @@ class Problem(NamedTuple):
 
     scene: rm.Scene
     expected: Any
-
-
-def table(name: str) -> list[dict[str, str]]:
-    """Rows of a file in `tests/data`; its first line is a comment."""
-    with (DATA / name).open() as file:
-        next(file)
-        return list(csv.DictReader(file))
-
-
-def probes(name: str) -> dict[str, Any]:
-    """The probes of scene "A" or "C" (see `data/README.md`)."""
-    return json.loads((DATA / f"{name}_probes.json").read_text())
 
 
 def cube(n: int) -> rm.Lattice:

@@ -1,0 +1,219 @@
+"""The command line of the benchmarks. Only click is imported before a command runs.
+
+Public name: `main`.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import click
+
+_QUESTIONS = {
+    "accuracy": "How far from known answers is the solver, and what does that cost?",
+    "error-vs-time": "Which size, how many directions and which quadrature give the smallest error in a given time?",
+    "peer": "How long do we take for an error of 1 %, and how long does a path tracer on the same cores?",
+}
+
+
+class _Problem(click.ParamType):
+    name = "problem"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        import problems
+
+        if value not in problems.CASES:
+            self.fail(f"got {value!r}, expected one of {', '.join(problems.CASES)}", param, ctx)
+        return value
+
+
+class _NewFile(click.Path):
+    """A file that can be written."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path, dir_okay=False, writable=True)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        path = super().convert(value, param, ctx)
+        if not Path(str(path)).parent.is_dir():
+            self.fail(f"got {str(value)!r}, expected a directory that exists; make it first, or write elsewhere", param, ctx)
+        return path
+
+
+def _at_least(least: int) -> click.IntRange:
+    return click.IntRange(min=least)
+
+
+_quick = click.option("--quick", is_flag=True, help="Small sizes and few directions: not the figures to quote.")
+_only = click.option("--only", type=_Problem(), multiple=True, metavar="NAME", help="This problem; may be repeated.")
+_json = click.option("--json", "json_file", type=_NewFile(), metavar="FILE", help="Write the record there.")
+_repeats = click.option("--repeats", type=_at_least(0), default=1, show_default=True, help="Timed solves after the first.")
+
+
+def _sizes(help_text: str) -> Callable[..., Any]:
+    return click.option("--size", "sizes", type=_at_least(1), multiple=True, metavar="N", help=help_text)
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+def main() -> None:
+    """How accurate the solver is on problems with known answers, and what that costs."""
+
+
+@main.command()
+@_quick
+@_only
+@_sizes("Voxels along the longest side; may be repeated. [default: the size each problem's target is meant for]")
+@click.option("--all-sizes", is_flag=True, help="All of each problem's own sizes.")
+@click.option("--directions", type=_at_least(9), metavar="N", help="[default: 200; with --quick 60]")
+@click.option("--quadrature", default="fibonacci", show_default=True, metavar="NAME", help="The kind of set.")
+@_repeats
+@_json
+def accuracy(
+    quick: bool,
+    only: tuple[str, ...],
+    sizes: tuple[int, ...],
+    all_sizes: bool,
+    directions: int | None,
+    quadrature: str,
+    repeats: int,
+    json_file: Path | None,
+) -> None:
+    """Errors, seconds and memory on the problems of the catalogue."""
+    import problems
+
+    from .measure import Job, run
+    from .record import environment, write
+    from .table import accuracy_table
+
+    _check_quadrature(quadrature)
+    if sum(map(bool, (sizes, quick, all_sizes))) > 1:
+        raise click.UsageError("--quick, --all-sizes and --size exclude one another; keep one of them")
+    jobs = []
+    for name in only or problems.CASES:
+        case = problems.CASES[name]
+        chosen = sizes or (case.sizes if all_sizes else case.sizes[:1] if quick else case.sizes[-1:])
+        count = directions or (60 if quick else case.directions)
+        jobs += [Job(name, size, count, quadrature, 0 if quick else repeats) for size in chosen]
+    records = []
+    for record in run(jobs, _tell):
+        records.append(record)
+        write(json_file, _QUESTIONS["accuracy"], records, environment=environment())
+    _print_environment(environment())
+    click.echo(accuracy_table(records))
+    click.echo("Errors in per cent of the value, or of " + "; ".join(_scales(records)) if _scales(records) else "")
+    if any("error" in record for record in records):
+        raise SystemExit(1)
+
+
+@main.command("error-vs-time")
+@_quick
+@_only
+@_sizes("May be repeated. [default: 16, 32 and 64; with --quick 8 and 16]")
+@click.option("--directions", "counts", type=_at_least(9), multiple=True, metavar="N", help="[default: 50, 100, 200, 400]")
+@click.option("--quadrature", "quadratures", multiple=True, metavar="NAME", help="May be repeated. [default: all]")
+@click.option("--out", type=_NewFile(), metavar="FILE.png", help="Draw the work-precision plot there (extra: plot).")
+@click.option("--peer", type=click.Path(path_type=Path, exists=True), metavar="FILE", help="Add the curve of a peer's record.")
+@_repeats
+@_json
+def error_vs_time(
+    quick: bool,
+    only: tuple[str, ...],
+    sizes: tuple[int, ...],
+    counts: tuple[int, ...],
+    quadratures: tuple[str, ...],
+    out: Path | None,
+    peer: Path | None,
+    repeats: int,
+    json_file: Path | None,
+) -> None:
+    """Sweep sizes, numbers of directions and quadratures; draw error against time."""
+    import json
+
+    from .measure import QUADRATURES, Job, run
+    from .record import environment, write
+    from .table import accuracy_table
+
+    for name in quadratures:
+        _check_quadrature(name)
+    if out is not None:
+        from .plot import check_matplotlib
+
+        check_matplotlib()
+    sizes = sizes or ((8, 16) if quick else (16, 32, 64))
+    counts = counts or ((50, 100) if quick else (50, 100, 200, 400))
+    names = quadratures or (("fibonacci",) if quick else tuple(QUADRATURES))
+    jobs = [
+        Job(problem, size, count, quadrature, repeats)
+        for problem in only or ("room", "fog")
+        for quadrature in names
+        for size in sizes
+        for count in counts
+    ]
+    records = []
+    for record in run(jobs, _tell):
+        records.append(record)
+        write(json_file, _QUESTIONS["error-vs-time"], records, environment=environment())
+    if out is not None:
+        from .plot import work_precision
+
+        work_precision(records, out, json.loads(peer.read_text()) if peer else None)
+        click.echo(f"wrote {out}", err=True)
+    _print_environment(environment())
+    click.echo(accuracy_table(records))
+
+
+@main.command()
+@_quick
+@click.option("--scene", "scenes", type=click.Choice(["A", "C"]), multiple=True, help="May be repeated. [default: both]")
+@_sizes("Of our solves; may be repeated. [default: 8, 16 and 32; with --quick 8]")
+@click.option("--directions", "counts", type=_at_least(9), multiple=True, metavar="N", help="[default: 50, 100 and 200]")
+@click.option("--seconds", type=float, default=120.0, show_default=True, help="The most Mitsuba gets for a scene and quantity.")
+@click.option("--goal", type=float, default=0.01, show_default=True, help="The rms error to reach.")
+@click.option("--out", type=_NewFile(), metavar="FILE.png", help="Draw error against time there (extra: plot).")
+@_json
+def peer(
+    quick: bool,
+    scenes: tuple[str, ...],
+    sizes: tuple[int, ...],
+    counts: tuple[int, ...],
+    seconds: float,
+    goal: float,
+    out: Path | None,
+    json_file: Path | None,
+) -> None:
+    """Mitsuba 3 and this package on scenes A and C, one after the other on the same cores."""
+    from .peer import compare
+    from .record import environment, write
+
+    scenes = scenes or ("A", "C")
+    sizes = sizes or ((8,) if quick else (8, 16, 32))
+    counts = counts or ((50,) if quick else (50, 100, 200))
+    result = compare(scenes, sizes, counts, 5.0 if quick else seconds, goal, _tell)
+    about = environment("mitsuba", "drjit")
+    write(json_file, _QUESTIONS["peer"], result.ours, environment=about, mitsuba=result.curves, summary=result.summary)
+    if out is not None:
+        from .plot import work_precision
+
+        work_precision(result.ours, out, {"mitsuba": result.curves})
+    _print_environment(about)
+    click.echo(result.table())
+
+
+def _check_quadrature(name: str) -> None:
+    from .measure import QUADRATURES
+
+    if name not in QUADRATURES:
+        raise click.UsageError(f"--quadrature: got {name!r}, expected one of {', '.join(QUADRATURES)}")
+
+
+def _tell(text: str) -> None:
+    click.echo(text, err=True)
+
+
+def _scales(records: list[dict[str, Any]]) -> list[str]:
+    named = {r["problem"]: r["errors_of"] for r in records if r.get("errors_of", "the value") != "the value"}
+    return [f"{what} ({name})" for name, what in named.items()]
+
+
+def _print_environment(about: dict[str, Any]) -> None:
+    click.echo(", ".join(f"{name} {value}" for name, value in about.items()))

@@ -1,0 +1,136 @@
+"""One problem, one size, one quadrature: errors, seconds and memory, measured in a process of its own.
+
+The first solve compiles; those that follow do not. "compile" is the difference between the first and the median of the
+others. Reading values out of a solution (final gathers, pictures) is timed apart, for each reader, likewise without its
+compilation.
+
+Public names: `Job`, `measure`, `run`, `QUADRATURES`.
+"""
+
+import math
+import multiprocessing
+import statistics
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import asdict, dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from .record import peak_memory
+
+if TYPE_CHECKING:
+    from raymanifold_jax.quadrature import Quadrature
+
+
+def _light_ray_cube(count: int) -> "Quadrature":
+    import raymanifold_jax as rm
+
+    return rm.quadrature.light_ray_cube(max(1, round(math.sqrt((count - 2) / 24))))
+
+
+def _product(count: int) -> "Quadrature":
+    import raymanifold_jax as rm
+
+    polar = max(2, round(math.sqrt(count / 2)))
+    return rm.quadrature.product(polar, 2 * polar)
+
+
+def _fibonacci(count: int) -> "Quadrature":
+    import raymanifold_jax as rm
+
+    return rm.quadrature.fibonacci(count)
+
+
+#: By name: a number of directions to the quadrature whose own number is nearest.
+QUADRATURES: Mapping[str, Callable[[int], "Quadrature"]] = MappingProxyType(
+    {"fibonacci": _fibonacci, "light-ray-cube": _light_ray_cube, "product": _product}
+)
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to measure: a problem of the catalogue, its size, and the directions; `repeats` solves after the first."""
+
+    problem: str
+    size: int
+    directions: int
+    quadrature: str = "fibonacci"
+    repeats: int = 1
+
+
+def measure(job: Job) -> dict[str, Any]:
+    """Solve and read, in this process. The record has no arrays."""
+    import jax
+    import problems
+
+    import raymanifold_jax as rm
+
+    case = problems.CASES[job.problem]
+    scene, quadrature = case.build(job.size), QUADRATURES[job.quadrature](job.directions)
+
+    def solve() -> rm.Solution:
+        solution = rm.solve(scene, quadrature, rtol=case.rtol, progress=False)
+        jax.block_until_ready(solution.diffuse_fluence)
+        return solution
+
+    first, solution = _timed(solve)
+    warm = [_timed(solve)[0] for _ in range(job.repeats)]
+    read, quantities, targets = {}, {}, case.targets(job.size)
+    for name, reader in case.readers.items():
+        seconds, values = _timed(lambda reader=reader: reader(solution))
+        read[name] = _timed(lambda reader=reader: reader(solution))[0] if job.repeats else seconds
+        quantities |= {quantity: _errors(r, targets.get(quantity)) for quantity, r in values.items()}
+    again = statistics.median(warm) if warm else None
+    return asdict(job) | {
+        "title": case.title,
+        "errors_of": case.errors_of,
+        "directions": len(quadrature),
+        "voxels": scene.lattice.size,
+        "seconds": {
+            "first": first,
+            "warm": again,
+            "spread": max(warm) - min(warm) if warm else None,
+            "compile": None if again is None else first - again,
+            "read": read,
+        },
+        "memory": peak_memory(),
+        "sweeps": solution.sweeps,
+        "converged": solution.converged,
+        "error_bound": float(solution.error_bound),
+        "imbalance": float(solution.energy.imbalance),
+        "quantities": quantities,
+    }
+
+
+def run(jobs: Iterable[Job], tell: Callable[[str], None]) -> Iterator[dict[str, Any]]:
+    """Records of jobs, one after the other, each from a fresh process; a job that fails gives a record with "error"."""
+    for job in jobs:
+        tell(f"{job.problem}, {job.size} voxels, {job.directions} directions ({job.quadrature})")
+        # Spawned, because a fork of a process in which JAX runs can hang.
+        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+            try:
+                yield pool.submit(measure, job).result()
+            except BrokenProcessPool:
+                yield asdict(job) | {"error": "the process died: out of memory?"}
+            except (ValueError, RuntimeError, MemoryError) as error:
+                yield asdict(job) | {"error": str(error)}
+
+
+def _timed(function: Callable[[], Any]) -> tuple[float, Any]:
+    began = time.perf_counter()
+    result = function()
+    return time.perf_counter() - began, result
+
+
+def _errors(readings: Any, target: Any) -> dict[str, Any]:
+    return {
+        "points": len(readings.ours),
+        "bias": readings.bias(),
+        "rms": readings.rms(),
+        "worst": readings.worst(),
+        "reference_error": readings.reference_error(),
+        "target": None if target is None else target._asdict(),
+        "met": None if target is None else target.met(readings),
+    }
