@@ -32,6 +32,7 @@ _MODULE_OF = {
     "Sun": "scene",
     "Wall": "scene",
     "Characteristic": "transport.characteristic",
+    "LightRayCube": "transport.light_ray_cube",
     "Jacobi": "iteration",
     "Krylov": "iteration",
     "Solution": "solution",
@@ -82,6 +83,7 @@ if TYPE_CHECKING:
     from raymanifold_jax.solution import Solution as Solution
     from raymanifold_jax.solve import solve as solve
     from raymanifold_jax.transport.characteristic import Characteristic as Characteristic
+    from raymanifold_jax.transport.light_ray_cube import LightRayCube as LightRayCube
 
 
 def __getattr__(name: str) -> Any:
