@@ -109,8 +109,8 @@ def coordinate_evolution(
 
     def one_face(face, own: Faces, plane: Plane, sums):
         slabs = _on_face(face, lambda f: _slabs(lattice, plane, f, fields, gather))
-        light = None if sky is None else _Sky(sky, *_on_face(face, lambda f: _sides(lattice, f)))
-        step = _Step(plane, slabs, light, scheme, lattice.spacing)
+        edges = _on_face(face, lambda f: _edges(lattice, f))
+        step = _Step(plane, slabs, edges, sky, scheme, lattice.spacing)
         return jax.tree.map(
             lambda total, s: total + _on_face(face, lambda f: turned_back(plane.unflat(s), lattice, f)),
             sums,
@@ -152,17 +152,16 @@ def _slabs(lattice: RayLattice, plane: Plane, face: int, fields: NodeFields, gat
     return _Slabs(along(fields.normal), along(gather), *map(flat, others))  # pyright: ignore[reportArgumentType]
 
 
-class _Sky(NamedTuple):
-    """Light beyond the sides: by direction; which sides of `entry_sides` are open; the lattice's size along u and v."""
+class _Edges(NamedTuple):
+    """Where the lattice ends on a face: which of the `entry_sides` are open, and its size along (u, v)."""
 
-    radiance: Float[Array, "C n"]
     open: Array
     size: Array
 
 
-def _sides(lattice: RayLattice, face: int) -> tuple[Array, Array]:
+def _edges(lattice: RayLattice, face: int) -> _Edges:
     opened = [lattice.open[side] for side in entry_sides(face)]
-    return jnp.asarray(opened), jnp.asarray([lattice.shape[a] for a in AXES[face // 2][1:]])
+    return _Edges(jnp.asarray(opened), jnp.asarray([lattice.shape[a] for a in AXES[face // 2][1:]]))
 
 
 class _Own(NamedTuple):
@@ -181,7 +180,8 @@ class _Step(NamedTuple):
 
     plane: Plane
     slabs: _Slabs
-    sky: _Sky | None
+    edges: _Edges
+    sky: Array | None  # radiance beyond open sides, (bands, directions)
     scheme: LightRayCube
     spacing: float
 
@@ -189,19 +189,19 @@ class _Step(NamedTuple):
         """Light beyond the lattice: at the inert nodes around every plane, and before the first; [D, C, 1, P] each."""
         if self.sky is None:
             return None
-        plane, sky = self.plane, self.sky
-        column = (jnp.arange(plane.stride)[None] >= sky.size[1]) & (plane.margin == 0)
+        plane, edges = self.plane, self.edges
+        column = (jnp.arange(plane.stride)[None] >= edges.size[1]) & (plane.margin == 0)
         # On the torus what is beyond the low end of a row lies at the end of the row before.
         late = column & (own.hop[:, 1, None, None] > 0)
-        row = (jnp.arange(plane.height)[:, None] + late) % plane.height >= sky.size[0]
+        row = (jnp.arange(plane.height)[:, None] + late) % plane.height >= edges.size[0]
         through = lambda hops, low, high: jnp.where(hops > 0, low, high)[:, None, None]
-        u = through(own.hop[:, 0], sky.open[1], sky.open[2])
-        v = through(own.hop[:, 1], sky.open[3], sky.open[4])
+        u = through(own.hop[:, 0], edges.open[1], edges.open[2])
+        v = through(own.hop[:, 1], edges.open[3], edges.open[4])
         # Where two sides meet, a wall goes on beyond the open one.
         across = (~row | u) & (~column | v)
         flat = lambda mask: mask.reshape(mask.shape[0], 1, 1, -1)
-        light = sky.radiance.T[own.index][:, :, None, None]
-        return jnp.where(flat(across & (row | column)), light, 0.0), jnp.where(flat(across & sky.open[0]), light, 0.0)
+        light = self.sky.T[own.index][:, :, None, None]
+        return jnp.where(flat(across & (row | column)), light, 0.0), jnp.where(flat(across & edges.open[0]), light, 0.0)
 
     def __call__(self, k: Array | int, rays: Array, own: _Own, around: Array | None) -> tuple[Array, Array, Array]:
         """One hop, to slab k: the light that goes on; that arrives, times its cosine; and that is there."""
@@ -209,7 +209,7 @@ class _Step(NamedTuple):
         here = jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, k, 0, keepdims=False), self.slabs)
         rays = hop(rays, own.hop, plane.height, plane.width, plane.margin)
         if here.extinction is not None:
-            rays = self._through_medium(rays, here, own)
+            rays = self._through_medium(k, rays, here, own)
         facing = _towards(here.normal, own)
         there = jnp.where(facing > _LEVEL, here.exitance, rays) * here.alive
         goes_on = there if scheme.grazing == "passes" else jnp.where(facing < -_LEVEL, 0.0, there)
@@ -218,18 +218,37 @@ class _Step(NamedTuple):
             arrives = jnp.maximum(-_towards(here.gather, own), 0.0) * goes_on
         return goes_on if around is None else goes_on + around, arrives, there
 
-    def _through_medium(self, rays: Array, here: _Slabs, own: _Own) -> Array:
+    def _through_medium(self, k: Array | int, rays: Array, here: _Slabs, own: _Own) -> Array:
         """What a hop leaves of light, and adds to it: the volume term (paper, section 8), with h the spacing,
 
         linear:       L (1 - d) + S d,  d = (gamma + zeta) M h,  so that S d = (zeta Lambda / 4 pi + emission) M h
         exponential:  L exp(-d) + S (1 - exp(-d)),  d = (gamma + zeta) |L| h
+
+        Of a hop into the lattice d is the part inside.
         """
         assert here.extinction is not None and here.source is not None
-        if self.scheme.attenuation == "linear":
-            kept = 1 - here.extinction * (self.scheme.half_width * self.spacing)
-        else:
-            kept = jnp.exp(-here.extinction * (own.length * self.spacing)[:, None, None, None])
-        return here.source + (rays - here.source) * kept
+        linear = self.scheme.attenuation == "linear"
+        nodes = self.scheme.half_width if linear else own.length[:, None, None, None]
+        depth = here.extinction * self._inside(k, own) * (nodes * self.spacing)
+        return here.source + (rays - here.source) * (1 - depth if linear else jnp.exp(-depth))
+
+    def _inside(self, k: Array | int, own: _Own) -> Array:
+        """The share of each hop to slab k that is inside the lattice; [D, 1, M, P]."""
+        plane, real = self.plane, own.length.dtype
+        share = lambda nodes, slope: jnp.minimum((nodes + 0.5) / jnp.maximum(jnp.abs(slope), 0.5), 1.0)
+        m = plane.half_width
+        inside = jnp.ones((1, 1, m, 1), real)
+        if not plane.periodic:
+            inside = share(k * m + jnp.arange(m), m)[None, None, :, None]
+        for i, (nodes, wraps) in enumerate(((plane.height, plane.wrap_u), (plane.width, plane.margin > 0))):
+            if wraps:
+                continue
+            place = jnp.arange(nodes)
+            ahead = jnp.where(own.hop[:, i, None] > 0, place, self.edges.size[i] - 1 - place)
+            part = share(jnp.maximum(ahead, 0), own.hop[:, i, None])
+            spread = jnp.repeat(part, plane.stride, 1) if i == 0 else jnp.tile(part, (1, plane.height))
+            inside = jnp.minimum(inside, spread[:, None, None, :])
+        return inside
 
     def start(self, own: _Own, before: Array | None) -> Array:
         plane, bands = self.plane, self.slabs.exitance.shape[1]
@@ -289,17 +308,23 @@ def _add(total: Array, k: Array, weight: Array, values: Array) -> Array:
     return lax.dynamic_update_index_in_dim(total, row + jnp.tensordot(weight, values, 1), k, 0)
 
 
-def count_laps(lattice: RayLattice, fields: NodeFields, faces: Faces, scheme: LightRayCube, most: int) -> Faces:
-    """The faces with the number of laps after which less than 1e-6 of the light on a periodic axis is left, at most `most`."""
+def count_laps(lattice: RayLattice, fields: NodeFields, faces: Faces, scheme: LightRayCube) -> Faces:
+    """The faces with the number of laps after which less than 1e-6 of the light on a periodic axis is left.
+
+    Rays along an axis that meet nothing never end; so laps are counted until every ray that crosses the lattice's other axes has
+    done so. What is still going then carries light from its last laps only.
+    """
+    m, others = lattice.half_width, [n for n, p in zip(lattice.shape, lattice.periodic, strict=True) if not p]
     dark = eqx.tree_at(lambda f: f.exitance, fields, jnp.zeros_like(fields.exitance))
     if fields.source is not None:
         dark = eqx.tree_at(lambda f: f.source, dark, jnp.zeros_like(fields.source))
     laps = []
     for face in range(6):
         plane, directions = make_plane(lattice, face // 2), jax.tree.map(lambda a, f=face: a[f], faces)
-        step = _Step(plane, _slabs(lattice, plane, face, dark, None), None, scheme, lattice.spacing)
+        step = _Step(plane, _slabs(lattice, plane, face, dark, None), _edges(lattice, face), None, scheme, lattice.spacing)
+        most = -(-m * max(others or lattice.shape) // plane.planes) + 1
 
-        def chunk_laps(number, step=step, directions=directions):
+        def chunk_laps(number, step=step, directions=directions, most=most):
             own = _own(directions, number)
             lit = jnp.where(own.weight[:, None, None, None] > 0, jnp.ones_like(step.start(own, None)), 0.0)
             more = lambda state: (state[0] < most) & (jnp.max(state[1]) > _ENDED)

@@ -33,8 +33,6 @@ from .light_ray_cube import LightRayCube, NodeFields, coordinate_evolution, coun
 from .ray_layout import Faces, RayLattice, make_faces
 from .ray_nodes import RayNodes, find_nodes
 
-_MOST_LAPS = 4096
-
 
 class CubeTransport(eqx.Module):
     """One coordinate evolution as an operator on the light of SURFACE nodes (elements) and voxels."""
@@ -176,13 +174,7 @@ def _with_laps(lattice: RayLattice, fields: NodeFields, faces: Faces, scheme: Li
     dark = jnp.zeros((bands, *lattice.padded), fields.normal.dtype)
     source = None if fields.extinction is None else dark
     lit = dataclasses.replace(fields, exitance=dark, source=source)
-    faces = eqx.filter_jit(count_laps)(lattice, lit, faces, scheme, _MOST_LAPS)
-    if int(faces.laps.max()) > _MOST_LAPS:
-        raise ValueError(
-            f"boundary: some rays are still going after {_MOST_LAPS} laps of a periodic axis; expected every ray to meet "
-            "a surface, an open side or an absorbing medium; close or open another side, or add absorption"
-        )
-    return faces
+    return eqx.filter_jit(count_laps)(lattice, lit, faces, scheme)
 
 
 def _rest(scene: Scene, nodes: RayNodes, transport: CubeTransport, stuff, sky) -> Light:

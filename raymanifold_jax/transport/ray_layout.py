@@ -97,6 +97,7 @@ class Plane(NamedTuple):
 
     planes: int
     periodic: bool  # the sweep axis
+    wrap_u: bool
     half_width: int
     height: int
     width: int
@@ -124,7 +125,7 @@ class Plane(NamedTuple):
 def make_plane(lattice: RayLattice, axis: int) -> Plane:
     _, u, v = AXES[axis]
     margin = lattice.half_width if lattice.periodic[v] else 0
-    return Plane(lattice.shape[axis], lattice.periodic[axis], lattice.half_width, lattice.padded[u], lattice.padded[v], margin)
+    return Plane(lattice.shape[axis], lattice.periodic[axis], lattice.periodic[u], lattice.half_width, lattice.padded[u], lattice.padded[v], margin)
 
 
 def turned(field: Float[Array, "*C X Y Z"], lattice: RayLattice, face: int) -> Float[Array, "*C A U V"]:
