@@ -175,6 +175,14 @@ class _Own(NamedTuple):
     laps: Array
 
 
+class _Around(NamedTuple):
+    """What does not change from plane to plane: light beyond the sides, and the share of hops that is inside them."""
+
+    before: Array | None
+    light: Array | None
+    inside: Array | None
+
+
 class _Step(NamedTuple):
     """Everything the rays of one face share."""
 
@@ -185,10 +193,15 @@ class _Step(NamedTuple):
     scheme: LightRayCube
     spacing: float
 
-    def beyond(self, own: _Own) -> tuple[Array, Array] | None:
-        """Light beyond the lattice: at the inert nodes around every plane, and before the first; [D, C, 1, P] each."""
+    def around(self, own: _Own) -> _Around:
+        """What a chunk of directions meets at the sides of every plane: worked out once for all planes."""
+        before, beside = self._beyond(own)
+        return _Around(before, beside, None if self.slabs.extinction is None else self._inside(own))
+
+    def _beyond(self, own: _Own) -> tuple[Array | None, Array | None]:
+        """Light beyond the lattice: before the first plane, and at the inert nodes around every plane; [D, C, 1, P] each."""
         if self.sky is None:
-            return None
+            return None, None
         plane, edges = self.plane, self.edges
         column = (jnp.arange(plane.stride)[None] >= edges.size[1]) & (plane.margin == 0)
         # On the torus what is beyond the low end of a row lies at the end of the row before.
@@ -201,24 +214,24 @@ class _Step(NamedTuple):
         across = (~row | u) & (~column | v)
         flat = lambda mask: mask.reshape(mask.shape[0], 1, 1, -1)
         light = self.sky.T[own.index][:, :, None, None]
-        return jnp.where(flat(across & (row | column)), light, 0.0), jnp.where(flat(across & edges.open[0]), light, 0.0)
+        return jnp.where(flat(across & edges.open[0]), light, 0.0), jnp.where(flat(across & (row | column)), light, 0.0)
 
-    def __call__(self, k: Array | int, rays: Array, own: _Own, around: Array | None) -> tuple[Array, Array, Array]:
+    def __call__(self, k: Array | int, rays: Array, own: _Own, around: _Around) -> tuple[Array, Array, Array]:
         """One hop, to slab k: the light that goes on; that arrives, times its cosine; and that is there."""
         plane, scheme = self.plane, self.scheme
         here = jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, k, 0, keepdims=False), self.slabs)
         rays = hop(rays, own.hop, plane.height, plane.width, plane.margin)
         if here.extinction is not None:
-            rays = self._through_medium(k, rays, here, own)
+            rays = self._through_medium(k, rays, here, own, around)
         facing = _towards(here.normal, own)
         there = jnp.where(facing > _LEVEL, here.exitance, rays) * here.alive
         goes_on = there if scheme.grazing == "passes" else jnp.where(facing < -_LEVEL, 0.0, there)
         arrives = jnp.maximum(-facing, 0.0) * rays
         if here.gather is not None:
             arrives = jnp.maximum(-_towards(here.gather, own), 0.0) * goes_on
-        return goes_on if around is None else goes_on + around, arrives, there
+        return goes_on if around.light is None else goes_on + around.light, arrives, there
 
-    def _through_medium(self, k: Array | int, rays: Array, here: _Slabs, own: _Own) -> Array:
+    def _through_medium(self, k: Array | int, rays: Array, here: _Slabs, own: _Own, around: _Around) -> Array:
         """What a hop leaves of light, and adds to it: the volume term (paper, section 8), with h the spacing,
 
         linear:       L (1 - d) + S d,  d = (gamma + zeta) M h,  so that S d = (zeta Lambda / 4 pi + emission) M h
@@ -226,36 +239,33 @@ class _Step(NamedTuple):
 
         Of a hop into the lattice d is the part inside.
         """
-        assert here.extinction is not None and here.source is not None
-        linear = self.scheme.attenuation == "linear"
-        nodes = self.scheme.half_width if linear else own.length[:, None, None, None]
-        depth = here.extinction * self._inside(k, own) * (nodes * self.spacing)
+        assert here.extinction is not None and here.source is not None and around.inside is not None
+        m, linear = self.scheme.half_width, self.scheme.attenuation == "linear"
+        inside = around.inside
+        if not self.plane.periodic:  # the first slab's hops come from before the first plane
+            inside = jnp.minimum(inside, ((k * m + jnp.arange(m) + 0.5) / m)[:, None])
+        nodes = m if linear else own.length[:, None, None, None]
+        depth = here.extinction * (inside * (nodes * self.spacing))
         return here.source + (rays - here.source) * (1 - depth if linear else jnp.exp(-depth))
 
-    def _inside(self, k: Array | int, own: _Own) -> Array:
-        """The share of each hop to slab k that is inside the lattice; [D, 1, M, P]."""
-        plane, real = self.plane, own.length.dtype
-        share = lambda nodes, slope: jnp.minimum((nodes + 0.5) / jnp.maximum(jnp.abs(slope), 0.5), 1.0)
-        m = plane.half_width
-        inside = jnp.ones((1, 1, m, 1), real)
-        if not plane.periodic:
-            inside = share(k * m + jnp.arange(m), m)[None, None, :, None]
+    def _inside(self, own: _Own) -> Array:
+        """The share of each hop that is inside the lattice's sides along u and v; [D, 1, 1, P]."""
+        plane = self.plane
+        inside = jnp.ones((len(own.length), plane.height, plane.stride), own.length.dtype)
         for i, (nodes, wraps) in enumerate(((plane.height, plane.wrap_u), (plane.width, plane.margin > 0))):
-            if wraps:
-                continue
-            place = jnp.arange(nodes)
-            ahead = jnp.where(own.hop[:, i, None] > 0, place, self.edges.size[i] - 1 - place)
-            part = share(jnp.maximum(ahead, 0), own.hop[:, i, None])
-            spread = jnp.repeat(part, plane.stride, 1) if i == 0 else jnp.tile(part, (1, plane.height))
-            inside = jnp.minimum(inside, spread[:, None, None, :])
-        return inside
+            if not wraps:
+                place, slope = jnp.arange(nodes), own.hop[:, i, None]
+                ahead = jnp.where(slope > 0, place, self.edges.size[i] - 1 - place)
+                share = (jnp.maximum(ahead, 0) + 0.5) / jnp.maximum(jnp.abs(slope), 0.5)
+                inside = jnp.minimum(inside, jnp.expand_dims(share, 2 - i))
+        return inside.reshape(len(inside), 1, 1, -1)
 
     def start(self, own: _Own, before: Array | None) -> Array:
         plane, bands = self.plane, self.slabs.exitance.shape[1]
         shape = (own.weight.shape[0], bands, plane.half_width, plane.height * plane.stride)
         return jnp.broadcast_to(jnp.zeros((), self.slabs.exitance.dtype) if before is None else before, shape)
 
-    def lap(self, rays: Array, own: _Own, around: Array | None) -> Array:
+    def lap(self, rays: Array, own: _Own, around: _Around) -> Array:
         """Carry rays once around a periodic axis."""
 
         def slab_step(k, carry):
@@ -285,7 +295,7 @@ def _sweep_face(step: _Step, faces: Faces, fluence: bool) -> tuple[Array, Array 
 
     def chunk_step(number, totals):
         own = _own(faces, number)
-        around, before = step.beyond(own) or (None, None)
+        around = step.around(own)
 
         def slab_step(k, carry):
             rays, (arriving, seen) = carry
@@ -294,7 +304,7 @@ def _sweep_face(step: _Step, faces: Faces, fluence: bool) -> tuple[Array, Array 
             seen = None if seen is None else _add(seen, k, own.weight, there)
             return rays, (arriving, seen)
 
-        rays = step.start(own, before)
+        rays = step.start(own, around.before)
         if step.plane.periodic:  # enough laps that where the light began no longer matters
             rays = lax.fori_loop(0, own.laps - 1, lambda _, r: step.lap(r, own, around), rays)
         return lax.fori_loop(0, count, slab_step, (rays, totals))[1]
@@ -326,9 +336,10 @@ def count_laps(lattice: RayLattice, fields: NodeFields, faces: Faces, scheme: Li
 
         def chunk_laps(number, step=step, directions=directions, most=most):
             own = _own(directions, number)
+            around = step.around(own)
             lit = jnp.where(own.weight[:, None, None, None] > 0, jnp.ones_like(step.start(own, None)), 0.0)
             more = lambda state: (state[0] < most) & (jnp.max(state[1]) > _ENDED)
-            return lax.while_loop(more, lambda s: (s[0] + 1, step.lap(s[1], own, None)), (jnp.int32(0), lit))[0] + 1
+            return lax.while_loop(more, lambda s: (s[0] + 1, step.lap(s[1], own, around)), (jnp.int32(0), lit))[0] + 1
 
         one = jnp.ones_like(faces.laps[face])
         laps.append(lax.map(chunk_laps, jnp.arange(len(one))) if plane.periodic else one)

@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from ..layout import AXES
 from ..quadrature import cube_points, light_ray_cube
 
-CHUNK = 1 << 18  # rays times bands in one step: a compromise between a CPU's caches and the cost of starting a step
+CHUNK = 1 << 19  # rays times bands in one step: a compromise between a CPU's caches and the cost of starting a step
 
 
 class Faces(eqx.Module):
