@@ -1,14 +1,30 @@
 """The light-ray-cube scheme of Langer, Breton & Zucker (Graphics Interface 1995): the paper, as it stands.
 
 Rays go through the nodes of the lattice along L = (p, q, r), the points on the surface of a cube of half-width M: 24 M^2 + 2
-directions (sections 2 and 6). One hop of a ray is L itself, M planes along the face's axis and (p, q) nodes across, so rays stay
-on nodes, and the planes fall into M interleaved families. The six faces hold (2M + 1)^2 entries each, 726 for M = 5; points on
-edges and corners lie on two or three of them. Each is swept once here, with its whole solid angle as its weight: the same
-sums as sweeping it on each of its faces with a part of that.
+directions (sections 2 and 6). One hop of a ray is L itself, M planes along the face's axis and (p, q) nodes across, so rays
+stay on nodes, and the planes fall into M interleaved families. The six faces hold (2M + 1)^2 entries each, 726 for M = 5;
+points on edges and corners lie on two or three of them. Each is swept once here, with its whole solid angle as its weight:
+the same sums as sweeping it on each of its faces with a part of that.
 
 One iteration is a *local transformation* (arriving to leaving light, node by node) and a *coordinate evolution* (leaving
 to arriving light, along the rays). The paper's wording was not at hand: both follow a description of it, and what is this
 module's reading of it is said where it matters.
+
+Where the scheme loses or makes light, by how much (M = 5 unless said; `tests/test_light_ray_cube.py` measures it again):
+
+- Weights. The 726 entries with a whole cell's solid angle each add up to 1.107 of the sphere: an albedo over 0.904 would
+  amplify. Points on edges and corners must share theirs; they do here.
+- Cosines. The weights' sums of |N . L| over half the sphere are 0.995 to 1.0015 of pi, by the normal (M = 2: 0.968 to 1.008).
+- Linear attenuation. |L| is 1.22 M in the mean, but every hop counts as M: a medium is taken to be thinner by that. Between
+  plates 1.5 optical depths apart, 20 % more light gets through than with exponential attenuation (24 planes, M = 3).
+- Layers. Light leaves one layer of SURFACE nodes and arrives at another, so a gap of n planes is crossed in less: in the
+  same gap 28 % more light gets through than should, and the power that medium and plates absorb is 21 % above what was sent.
+- Grazing light in a layer. If light ends at the first node that it arrives at, a direction that comes down r planes a hop
+  reaches r nodes of the M in a column: a flat surface loses 18 % of the light of a uniform sky, its innermost nodes most. The
+  three balls in fog (N = 64, iterated to the end) then have irradiances 41 % low and lose 23 % of their power; with light that
+  goes on to the solid, 3 % low, and 5 % too much power.
+- Edges. Nodes along a concave edge have slanting normals, and rays that arrive there from behind the wall arrive dark: a closed
+  room of 32 voxels with albedo 0.5 loses 8 % of its power, in proportion to M / N.
 
 Public: `LightRayCube`, `NodeFields`, `coordinate_evolution`, `local_transformation`, `count_laps`.
 """
@@ -42,8 +58,8 @@ class LightRayCube(eqx.Module):
     - `half_width`: M >= 1. Surfaces become layers of nodes M thick: solids, gaps and shadows are seen no finer than that.
     - `attenuation`: what a hop leaves of the light. "linear", as printed: 1 - extinction * M * spacing, for every
       direction alike; a medium in which that is negative is refused. "exponential": exp(-extinction * |L| * spacing).
-    - `grazing`: what becomes of light that arrives at a node of a surface's layer, where nodes deeper in the layer are still ahead.
-      "ends", as printed: it ends at the first. "passes": it goes on to the solid, and all see it.
+    - `grazing`: what becomes of light that arrives at a node of a surface's layer while deeper nodes are still ahead.
+      "passes": it goes on to the solid, and all of them see it. "ends": it ends at the first, and is lost to the others.
     """
 
     half_width: int = eqx.field(static=True, default=5)
@@ -95,14 +111,15 @@ def coordinate_evolution(
             R := radiance at x - L, after a hop through the medium
             case x of
                 FREE:                     R goes on
-                SURFACE and N . L < 0:    R arrives at x;  0 goes on              (`grazing="passes"`: R goes on)
+                SURFACE and N . L < 0:    R arrives at x, and goes on             (`grazing="ends"`: 0 goes on)
                 SURFACE and N . L > 0:    R := exitance of x, which goes on
                 SOLID:                    0 goes on
             E(x) += weight |N . L| R / |L|  where R arrives;    Lambda(x) += weight R
 
-    Where N . L = 0 exactly, as for an axis along a wall, light goes on as past a FREE node (this module's reading). R is
-    `sky` beyond an open side and 0 beyond a wall. Returns the mean radiances E / pi and Lambda / (4 pi); with `gather`, normals G, the
-    first is instead the sum of weight max(-G . L, 0) R / |L| / pi over all light that goes on from x.
+    Where N . L = 0 exactly, as for an axis along a wall, light goes on as past a FREE node; that, and that light goes on in the
+    layer until SOLID nodes end it, is this module's reading. R is `sky` beyond an open side and 0 beyond a wall. Returns the
+    mean radiances E / pi and Lambda / (4 pi); with `gather`, normals G, the first is instead the sum of
+    weight max(-G . L, 0) R / |L| / pi over all light that goes on from x.
     """
     zeros = jnp.zeros((fields.exitance.shape[0], *lattice.padded), fields.exitance.dtype)
     sums = (zeros, zeros if fluence else None)
@@ -321,8 +338,8 @@ def _add(total: Array, k: Array, weight: Array, values: Array) -> Array:
 def count_laps(lattice: RayLattice, fields: NodeFields, faces: Faces, scheme: LightRayCube) -> Faces:
     """The faces with the number of laps after which less than 1e-6 of the light on a periodic axis is left.
 
-    Rays along an axis that meet nothing never end; so laps are counted until every ray that crosses the lattice's other axes has
-    done so. What is still going then carries light from its last laps only.
+    Rays along an axis that meet nothing never end; so laps are counted until every ray that crosses the lattice's other axes
+    has done so. What is still going then carries light from its last laps only.
     """
     m, others = lattice.half_width, [n for n, p in zip(lattice.shape, lattice.periodic, strict=True) if not p]
     dark = eqx.tree_at(lambda f: f.exitance, fields, jnp.zeros_like(fields.exitance))

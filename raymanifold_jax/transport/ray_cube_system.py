@@ -130,9 +130,7 @@ def make_cube_system(scene: Scene, surfaces: Surfaces, scheme: LightRayCube) -> 
     periodic = scene.boundary.periodic
     padded = [n if wraps else n + m for n, wraps in zip(scene.lattice.shape, periodic, strict=True)]
     opened = tuple(kind is OPEN for kind in scene.boundary.sides)
-    lattice = RayLattice(
-        scene.lattice.shape, (padded[0], padded[1], padded[2]), periodic, opened, m, scene.lattice.spacing
-    )
+    lattice = RayLattice(scene.lattice.shape, (padded[0], padded[1], padded[2]), periodic, opened, m, scene.lattice.spacing)
     real = jnp.zeros(0).dtype
     spread = lambda field: lattice.to_padded(jnp.asarray(field, real))
     extinction = None if stuff.extinction is None else lattice.to_padded(stuff.extinction)
@@ -163,8 +161,8 @@ def _check_depth(scheme: LightRayCube, extinction: float, spacing: float) -> Non
     depth = extinction * scheme.half_width * spacing
     if scheme.attenuation == "linear" and depth > 1:
         raise ValueError(
-            f"attenuation: got 'linear' and an extinction of {depth:.3g} a hop of {scheme.half_width} voxels, expected at most 1 "
-            "(1 - extinction must not be negative); use attenuation='exponential', more voxels, or a smaller half_width"
+            f"attenuation: got 'linear' and an extinction of {depth:.3g} a hop of {scheme.half_width} voxels, expected at most "
+            "1 (1 - extinction must not be negative); use attenuation='exponential', more voxels, or a smaller half_width"
         )
 
 

@@ -1,8 +1,8 @@
 """How nodes and directions of the light-ray-cube scheme lie in memory.
 
-A *face* is one of the six of the light ray cube: face 2a holds the directions that go up axis a, face 2a + 1 those that go down it. Its
-planes, in the order in which its rays meet them, are taken M at a time: such a *slab* holds one plane of each of the M
-interleaved families that hops of M planes make.
+A *face* is one of the six of the light ray cube: face 2a holds the directions that go up axis a, face 2a + 1 those that go
+down it. Its planes, in the order in which its rays meet them, are taken M at a time: such a *slab* holds one plane of each of
+the M interleaved families that hops of M planes make.
 
 Public: `Faces`, `make_faces`, `RayLattice`, `Plane`, `make_plane`, `turned`, `turned_back`, `entry_sides`.
 """
@@ -125,7 +125,8 @@ class Plane(NamedTuple):
 def make_plane(lattice: RayLattice, axis: int) -> Plane:
     _, u, v = AXES[axis]
     margin = lattice.half_width if lattice.periodic[v] else 0
-    return Plane(lattice.shape[axis], lattice.periodic[axis], lattice.periodic[u], lattice.half_width, lattice.padded[u], lattice.padded[v], margin)
+    n, wraps, padded, m = lattice.shape, lattice.periodic, lattice.padded, lattice.half_width
+    return Plane(n[axis], wraps[axis], wraps[u], m, padded[u], padded[v], margin)
 
 
 def turned(field: Float[Array, "*C X Y Z"], lattice: RayLattice, face: int) -> Float[Array, "*C A U V"]:
