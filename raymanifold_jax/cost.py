@@ -11,8 +11,8 @@ characteristic scheme, whose slabs are one plane thick):
     exchanged  n C s sum over directions of  h w - max(h - |p|, 0) max(w - |q|, 0)        rays that leave their block
     rotation   n h w F s ((a - 1)/a + (b - 1)/b)    two all-to-alls, over the rows and over the columns of the array
 
-Sizes are those of the axis with the largest blocks; `exchanged` and `updates` are sums over the three axes. A direction's (p, q)
-is its hop; in the characteristic scheme its slopes, at most one node a plane.
+Sizes are those of the axis with the largest blocks; `exchanged` and `updates` are sums over the three axes. The (p, q) of a
+direction is its hop; in the characteristic scheme its slopes, at most one node a plane.
 
 Public: `CostReport`, `cost_report`, `numbers_per_node`, `PAPER`.
 """
