@@ -19,6 +19,8 @@ Where the scheme loses or makes light, by how much (M = 5 unless said; `tests/te
   plates 1.5 optical depths apart, 20 % more light gets through than with exponential attenuation (24 planes, M = 3).
 - Layers. Light leaves one layer of SURFACE nodes and arrives at another, so a gap of n planes is crossed in less: in the
   same gap 28 % more light gets through than should, and the power that medium and plates absorb is 21 % above what was sent.
+- Thicker bodies. A layer sends and stops light as if it were the surface: a ball with a radius of 8 voxels and M = 2 sends 1.9
+  times its power, one of 10 with M = 5 2.9 times.
 - Grazing light in a layer. If light ends at the first node that it arrives at, a direction that comes down r planes a hop
   reaches r nodes of the M in a column: a flat surface loses 18 % of the light of a uniform sky, its innermost nodes most. The
   three balls in fog (N = 64, iterated to the end) then have irradiances 41 % low and lose 23 % of their power; with light that

@@ -51,12 +51,10 @@ class CubeTransport(eqx.Module):
         return Light(arriving.reshape(len(arriving), -1)[:, self.cell], seen)
 
     @eqx.filter_jit
-    def outgoing(self, leaving: Light, sky: Float[Array, "C n"] | None, axis: int) -> Float[Array, "C nx ny nz"]:
-        """Mean radiance that goes out through the sides of an axis, at the nodes next to them."""
-        n = self.lattice.shape[axis]
-        outward = jnp.zeros(n, self.fields.normal.dtype).at[0].add(1.0).at[n - 1].add(-1.0)
-        inward = jnp.zeros((3, *self.lattice.shape), outward.dtype)
-        inward = inward.at[axis].set(jnp.expand_dims(outward, [a for a in range(3) if a != axis]))
+    def outgoing(
+        self, leaving: Light, sky: Float[Array, "C n"] | None, inward: Float[Array, "3 nx ny nz"]
+    ) -> Float[Array, "C nx ny nz"]:
+        """Mean radiance that goes out against the directions `inward`, at the nodes that have one."""
         fields, gather = self._with_light(leaving), self.lattice.to_padded(inward)
         return coordinate_evolution(self.lattice, fields, self.faces, self.scheme, sky, gather, False)[0]
 
@@ -95,6 +93,8 @@ class CubeSystem:
         return seen(rest, leaving), seen(sun, self.sun_leaving)
 
     def _mean(self, at_nodes: Float[Array, "C S"]) -> Float[Array, "C E"]:
+        if not len(self.nodes.cell):
+            return jnp.zeros((len(at_nodes), len(self.column)), at_nodes.dtype)
         weight = (self.column >= 0) / np.maximum((self.column >= 0).sum(1, keepdims=True), 1)
         picked = at_nodes[:, np.maximum(self.column, 0)]
         return jnp.einsum("cem,em->ce", picked, jnp.asarray(weight, at_nodes.dtype))
@@ -109,7 +109,10 @@ class CubeSystem:
             if len(rows):
                 transport = self.system.transport
                 assert isinstance(transport, CubeTransport)
-                out = transport.outgoing(sent, self.sky, axis)
+                inward = np.zeros((3, *self.nodes.solid.shape))
+                ends = np.moveaxis(inward[axis], axis, 0)
+                ends[0], ends[-1] = 1.0, -1.0
+                out = transport.outgoing(sent, self.sky, jnp.asarray(inward, sent.elements.dtype))
                 last = np.clip(surfaces.voxel[rows], 0, np.array(self.nodes.solid.shape) - 1)
                 total = total.at[:, rows].set(out[(slice(None), *last.T)])
         return total

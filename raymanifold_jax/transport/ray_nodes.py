@@ -134,7 +134,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def _owners(scene: Scene, position: np.ndarray, voxel: np.ndarray) -> np.ndarray:
-    """The solid or side nearest to each SURFACE node: numbers as in `Surfaces.material`."""
+    """The solid or side nearest to each SURFACE node, the first of equals: numbers as in `Surfaces.material`."""
     shape = np.array(scene.lattice.shape)
     distances = np.full((len(scene.solids) + 6, len(position)), np.inf)
     for number, solid in enumerate(scene.solids):
