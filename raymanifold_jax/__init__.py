@@ -32,6 +32,9 @@ _MODULE_OF = {
     "Sun": "scene",
     "Wall": "scene",
     "Characteristic": "transport.characteristic",
+    "LightRayCube": "transport.light_ray_cube",
+    "CostReport": "cost",
+    "cost_report": "cost",
     "Jacobi": "iteration",
     "Krylov": "iteration",
     "Solution": "solution",
@@ -54,6 +57,8 @@ if TYPE_CHECKING:
     from raymanifold_jax import scenes as scenes
     from raymanifold_jax.camera import OrthographicCamera as OrthographicCamera
     from raymanifold_jax.camera import PerspectiveCamera as PerspectiveCamera
+    from raymanifold_jax.cost import CostReport as CostReport
+    from raymanifold_jax.cost import cost_report as cost_report
     from raymanifold_jax.gather import fluence as fluence
     from raymanifold_jax.gather import irradiance as irradiance
     from raymanifold_jax.gather import outgoing_flux as outgoing_flux
@@ -82,6 +87,7 @@ if TYPE_CHECKING:
     from raymanifold_jax.solution import Solution as Solution
     from raymanifold_jax.solve import solve as solve
     from raymanifold_jax.transport.characteristic import Characteristic as Characteristic
+    from raymanifold_jax.transport.light_ray_cube import LightRayCube as LightRayCube
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""The command line: `raymanifold render`, `solve`, `scenes`, `info`.
+"""The command line: `raymanifold render`, `solve`, `scenes`, `info`, `cost`.
 
 Only click is imported here: everything heavy is loaded inside the commands, so that `--help` answers at once. All
 option values are checked before any work. Exit codes: 0; 1 where a solve did not converge (its pictures are written
@@ -55,6 +55,17 @@ class _Resolution(click.ParamType):
             expected = f"expected pixels from 1 to {_LARGEST_PICTURE}"
             self.fail(f"got {value!r}, {expected}; write 640x480, or 512 for a square", param, ctx)
         return sides[0], sides[-1]
+
+
+class _Elements(click.ParamType):
+    name = "elements"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        parts = str(value).lower().split("x")
+        sides = [int(part) if part.isascii() and part.isdigit() and len(part) < 10 else 0 for part in parts]
+        if not (len(sides) == 2 and min(sides) >= 1):
+            self.fail(f"got {value!r}, expected elements along u and v; write 64x32", param, ctx)
+        return sides[0], sides[1]
 
 
 class _Exposure(click.ParamType):
@@ -320,6 +331,35 @@ def info(scene: "SceneEntry | None", size: int | None, directions: int) -> None:
         need = estimate_memory(shape, built.bands, directions, built.medium is not None)
         fits = "" if available is None or need <= available else ": more than there is"
         _line(f"{entry.name} needs", f"{gigabytes(need)} at {' x '.join(map(str, shape))}{fits}")
+
+
+@main.command()
+@_scene
+@click.option(
+    "--size",
+    type=int,
+    metavar="N",
+    callback=_checked(lambda n: n >= 4, "a whole number >= 4", "128 is the paper's"),
+    help="Voxels a side. [default: the scene's own]",
+)
+@click.option("--pe", type=_Elements(), default="64x32", metavar="AxB", show_default=True, help="Processing elements.")
+@click.option(
+    "--half-width",
+    type=int,
+    metavar="M",
+    default=5,
+    show_default=True,
+    callback=_checked(lambda m: 1 <= m <= 64, "a whole number from 1 to 64", "5 is the paper's"),
+    help="Of the light ray cube.",
+)
+@click.option("--characteristic", is_flag=True, help="The characteristic scheme, with 200 directions, in place of the paper's.")
+def cost(scene: "SceneEntry", size: int | None, pe: tuple[int, int], half_width: int, characteristic: bool) -> None:
+    """What SCENE costs each processing element of an array, beside the paper's own numbers."""
+    import raymanifold_jax as rm
+
+    scheme = rm.Characteristic() if characteristic else rm.LightRayCube(half_width)
+    with _one_line_errors():
+        click.echo(str(rm.cost_report(scene.build(size or scene.default_size), scheme, pe)))
 
 
 def _build(entry: "SceneEntry", size: int, directions: int) -> "Scene":

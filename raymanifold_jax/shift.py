@@ -32,3 +32,25 @@ def _roll(values: Float[Array, "D C P"], offsets: Int[Array, " D"], reach: int) 
     padded = jnp.concatenate([values[..., -reach:], values, values[..., :reach]], axis=-1)
     size = values.shape[-1]
     return jax.vmap(lambda row, offset: lax.dynamic_slice_in_dim(row, reach - offset, size, axis=1))(padded, offsets)
+
+
+def hop(
+    rays: Float[Array, "D C M P"], hops: Int[Array, "D 2"], height: int, width: int, margin: int
+) -> Float[Array, "D C M P"]:
+    """Move the rays of each direction by its hop (p, q), at most M nodes either way, on a torus of `height` x `width` nodes.
+
+    Planes are flat; each row has `margin` nodes more at both ends, M or none. Without them the torus is broken at the ends of
+    rows: a ray that crosses one comes in again on the next row, which M inert nodes at the end of each row make harmless.
+    """
+    reach, stride = rays.shape[2], width + 2 * margin
+    if margin:
+        rows = rays.reshape(*rays.shape[:3], height, stride)[..., margin : margin + width]
+        around = jnp.arange(-margin, width + margin) % width
+        rays = rows[..., around].reshape(rays.shape)
+    size, most = height * stride, reach * (stride + 1)
+    if most <= size:
+        padded = jnp.concatenate([rays[..., -most:], rays, rays[..., :most]], axis=-1)
+    else:
+        padded = rays[..., jnp.arange(-most, size + most) % size]
+    offsets = hops[:, 0] * stride + hops[:, 1]
+    return jax.vmap(lambda row, offset: lax.dynamic_slice_in_dim(row, most - offset, size, axis=-1))(padded, offsets)

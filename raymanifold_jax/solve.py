@@ -27,6 +27,8 @@ from .scene import OPEN, PointLight, Scene, Sun
 from .solution import Energy, Solution, _Hidden
 from .surfaces import Surfaces, find_surfaces
 from .transport.characteristic import Characteristic
+from .transport.light_ray_cube import LightRayCube
+from .transport.ray_cube_system import CubeSystem, make_cube_system
 
 _DEFAULT_DIRECTIONS = 200
 
@@ -34,7 +36,7 @@ _DEFAULT_DIRECTIONS = 200
 def solve(
     scene: Scene,
     quadrature: Quadrature | None = None,
-    scheme: Characteristic | None = None,
+    scheme: Characteristic | LightRayCube | None = None,
     rtol: float = 1e-4,
     solver: Jacobi | Krylov | str = "auto",
     max_sweeps: int = 1000,
@@ -48,16 +50,19 @@ def solve(
 
     - `quadrature`: directions of the sweeps; `rm.quadrature.fibonacci(200)` if None. More directions reduce ray effects; time
       grows with their number.
-    - `scheme`: `rm.Characteristic()`.
+    - `scheme`: `rm.Characteristic()`, or the paper's `rm.LightRayCube(half_width=5)`, which brings its own directions:
+      leave `quadrature` out.
     - `rtol`: the certified error bound's target, relative to the largest radiosity or medium source (times pi).
-    - `solver`: `rm.Krylov()`, which is also what "auto" takes, or the paper's `rm.Jacobi()`.
-    - `max_sweeps`: the iteration stops there at the latest. With `throw`, that raises `RuntimeError`; without, read
+    - `solver`: `rm.Krylov()`, which is also what "auto" takes, or the paper's `rm.Jacobi()`, "auto" with its scheme.
+    - `max_sweeps`: the iteration stops there at the latest. With `Jacobi`, k of them are k of the paper's iterations: light
+      straight from the sources, and k bounces. With `throw`, that raises `RuntimeError`; without, read
       `Solution.converged` and `Solution.result`.
     - `progress`: True or None shows a bar on a terminal when the solve takes long; False never; or a `Progress`.
 
     **Raises** `ValueError` or `TypeError` for unusable arguments before any work, `RuntimeError` with `throw`.
     """
     _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh)
+    cube = scheme if isinstance(scheme, LightRayCube) else None
     quadrature = fibonacci(_DEFAULT_DIRECTIONS) if quadrature is None else quadrature
     check_memory(scene.lattice.shape, scene.bands, len(quadrature), scene.medium is not None)
     meter = make_progress(progress)
@@ -65,12 +70,17 @@ def solve(
         meter.start(f"solve {scene.summary()}")
         surfaces = find_surfaces(scene)
         stuff = materials(scene, surfaces)
-        layout = make_layout(scene, surfaces)
-        transport = make_transport(layout, quadrature, stuff.extinction, scene.bands, area=surfaces.area)
-        system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff))
+        nodes = None if cube is None else make_cube_system(scene, surfaces, cube)
+        if nodes is not None:
+            system, quadrature = nodes.system, nodes.quadrature
+        else:
+            layout = make_layout(scene, surfaces)
+            transport = make_transport(layout, quadrature, stuff.extinction, scene.bands, area=surfaces.area)
+            system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff))
         iteration = Iteration(system, certify(system), float(rtol), max_sweeps, meter)
-        (Krylov() if isinstance(solver, str) else solver).run(iteration)
-        solution = _finish(scene, surfaces, quadrature, iteration)
+        automatic = Krylov() if nodes is None else Jacobi()
+        (automatic if isinstance(solver, str) else solver).run(iteration)
+        solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes)
     if throw and not solution.converged:
         raise RuntimeError(f"solve: {solution.result}")
     return solution
@@ -84,7 +94,10 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh) 
         if abs(total / (4 * np.pi) - 1) > 1e-6:
             checks.fail("quadrature", f"weights that add up to {total:.6g}", "4 pi", "use a set of rm.quadrature as it is made")
     if scheme is not None:
-        checks.instance("scheme", scheme, Characteristic, "use rm.Characteristic()")
+        checks.instance("scheme", scheme, (Characteristic, LightRayCube), "use rm.Characteristic() or rm.LightRayCube()")
+    if isinstance(scheme, LightRayCube) and quadrature is not None:
+        got = f"{quadrature} with {scheme}"
+        checks.fail("quadrature", got, "None", "the light ray cube has its own directions: leave quadrature out")
     if not (isinstance(solver, Jacobi | Krylov) or solver == "auto"):
         checks.fail("solver", repr(solver), 'rm.Jacobi(), rm.Krylov() or "auto"', 'leave it at "auto"')
     if mesh is not None:
@@ -97,26 +110,32 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh) 
         )
 
 
-def _finish(scene: Scene, surfaces: Surfaces, quadrature: Quadrature, iteration: Iteration) -> Solution:
+def _finish(
+    scene: Scene, surfaces: Surfaces, quadrature: Quadrature, stuff: Materials, iteration: Iteration, nodes: CubeSystem | None
+) -> Solution:
     system, bounced = iteration.system, iteration.arriving
     # Within its bound a Krylov iterate may dip below 0, where the exact solution is not.
     bounced = jax.tree.map(lambda x: jnp.maximum(x, 0.0), bounced)
     if not system.scatters:  # the iteration did not need the light in the voxels
         everywhere = system.transport(system.materials.reflected(system.source + bounced), fluence=True)
         bounced = Light(bounced.elements, everywhere.voxels)
-    rest = system.direct.rest + bounced
-    outside = jnp.asarray(~surfaces.solid)
-    free = jnp.where(outside, system.transport.coverage / _whole(system.transport), 0.0)
+    rest, sun = system.direct.rest + bounced, system.direct.sun
+    if nodes is not None:
+        rest, sun, outside = *nodes.at_elements(rest, sun), jnp.asarray(~nodes.solid)
+        free = jnp.where(outside, jnp.ones((), rest.elements.dtype), 0.0)
+    else:
+        outside = jnp.asarray(~surfaces.solid)
+        free = jnp.where(outside, system.transport.coverage / _whole(system.transport), 0.0)
     fluence = lambda light: jnp.where(outside, 4 * jnp.pi * light.voxels, 0.0)
     fields = {
         "diffuse_irradiance": jnp.pi * rest.elements,
-        "sun_irradiance": jnp.pi * system.direct.sun.elements,
+        "sun_irradiance": jnp.pi * sun.elements,
         "diffuse_fluence": fluence(rest),
-        "sun_fluence": fluence(system.direct.sun),
+        "sun_fluence": fluence(sun),
     }
     return Solution(
-        scene=scene, **fields, free=free, albedo=system.materials.albedo, emission=system.materials.emission,
-        energy=_energy(scene, surfaces, quadrature, system.materials, free, fields),
+        scene=scene, **fields, free=free, albedo=stuff.albedo, emission=stuff.emission,
+        energy=_energy(scene, surfaces, quadrature, stuff, free, fields),
         error_bound=math.pi * iteration.bound, target=math.pi * iteration.target,
         history=math.pi * np.array(iteration.residuals[1:]), sweeps=iteration.sweeps + iteration.certificate.sweeps,
         converged=iteration.converged, stagnated=iteration.stagnated,
