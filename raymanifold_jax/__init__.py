@@ -20,6 +20,10 @@ _MODULE_OF = {
     "Shape": "shapes",
     "Sphere": "shapes",
     "Torus": "shapes",
+    "Mesh": "mesh",
+    "MeshReport": "mesh",
+    "Voxels": "voxels",
+    "voxel_solids": "voxels",
     "MIRROR": "scene",
     "OPEN": "scene",
     "PERIODIC": "scene",
@@ -61,6 +65,8 @@ if TYPE_CHECKING:
     from raymanifold_jax.iteration import Jacobi as Jacobi
     from raymanifold_jax.iteration import Krylov as Krylov
     from raymanifold_jax.lattice import Lattice as Lattice
+    from raymanifold_jax.mesh import Mesh as Mesh
+    from raymanifold_jax.mesh import MeshReport as MeshReport
     from raymanifold_jax.render import render as render
     from raymanifold_jax.scene import MIRROR as MIRROR
     from raymanifold_jax.scene import OPEN as OPEN
@@ -82,6 +88,8 @@ if TYPE_CHECKING:
     from raymanifold_jax.solution import Solution as Solution
     from raymanifold_jax.solve import solve as solve
     from raymanifold_jax.transport.characteristic import Characteristic as Characteristic
+    from raymanifold_jax.voxels import Voxels as Voxels
+    from raymanifold_jax.voxels import voxel_solids as voxel_solids
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""The command line: `raymanifold render`, `solve`, `scenes`, `info`.
+"""The command line: `raymanifold render`, `solve`, `init`, `scenes`, `info`.
 
 Only click is imported here: everything heavy is loaded inside the commands, so that `--help` answers at once. All
 option values are checked before any work. Exit codes: 0; 1 where a solve did not converge (its pictures are written
@@ -39,10 +39,25 @@ class _SceneName(click.ParamType):
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> "SceneEntry":
         from .scenes import find
 
+        if str(value).lower().endswith(".toml"):
+            with _one_line_errors():
+                return _scene_file(value)
         try:
             return find(value)
         except ValueError as error:
             self.fail(str(error), param, ctx)
+
+
+def _scene_file(path: str) -> "SceneEntry":
+    """A scene file as an entry of the catalogue."""
+    from .io import load_scene
+    from .scenes import STANDARD_VIEWS, SceneEntry
+
+    file = load_scene(path)
+    size = max(file.scene.lattice.shape)
+    build = lambda n: file.scene if n == size else load_scene(path, n).scene
+    views = file.cameras or STANDARD_VIEWS
+    return SceneEntry(file.path.stem, build, file.description or str(path), size, views)
 
 
 class _Resolution(click.ParamType):
@@ -223,7 +238,7 @@ def render(
     half: bool,
     **settings: Any,
 ) -> None:
-    """Solve SCENE (ring, three-balls or room) and write pictures of it."""
+    """Solve SCENE (ring, three-balls, room or a file.toml) and write pictures of it."""
     if camera is not None and all_views:
         raise click.UsageError("--camera and --all-views exclude each other; leave one out", ctx)
     if camera is not None and camera not in scene.views:
@@ -238,9 +253,7 @@ def render(
     size = settings["size"] or scene.default_size
     with _one_line_errors():
         built = _build(scene, size, settings["directions"])
-        from .scenes import cameras
-
-        views = cameras(scene.name, built, resolution)
+        views = {view: make(built.lattice, resolution) for view, make in scene.views.items()}
         solution, seconds = _solve(built, **settings)
 
         import raymanifold_jax as rm
@@ -270,7 +283,7 @@ def render(
 @_with(_solve_options)
 @click.pass_context
 def solve(ctx: click.Context, scene: "SceneEntry", **settings: Any) -> None:
-    """Solve SCENE (ring, three-balls or room) and print where its light goes."""
+    """Solve SCENE (ring, three-balls, room or a file.toml) and print where its light goes."""
     with _one_line_errors():
         built = _build(scene, settings["size"] or scene.default_size, settings["directions"])
         solution, seconds = _solve(built, **settings)
@@ -280,6 +293,27 @@ def solve(ctx: click.Context, scene: "SceneEntry", **settings: Any) -> None:
         for name, value in solution.energy._asdict().items():
             _line(f"  {name.replace('_', ' ')}", f"{float(value):.6g}")
     _warn_unless_converged(ctx, solution)
+
+
+@main.command()
+@click.argument("file", type=click.Path(path_type=Path), default="scene.toml", metavar="[FILE.toml]")
+@click.option("--force", is_flag=True, help="Replace a file that is there.")
+@click.pass_context
+def init(ctx: click.Context, file: Path, force: bool) -> None:
+    """Write a commented scene file to start from. [default: scene.toml]"""
+    from .io.exr import written_atomically
+    from .io.scene_writer import EXAMPLE
+
+    if file.suffix.lower() != ".toml":
+        raise click.UsageError(
+            f"FILE: got {str(file)!r}, expected a name that ends in .toml; write {str(file) + '.toml'!r}", ctx
+        )
+    _check_writable(file, ctx)
+    if file.exists() and not force:
+        raise click.UsageError(f"FILE: got {str(file)!r}, which is there; expected a new name; --force replaces it", ctx)
+    with _one_line_errors(), written_atomically(file) as temporary:
+        temporary.write_text(EXAMPLE, encoding="utf-8")
+    _line("wrote", f"{file}; next: raymanifold render {file}")
 
 
 @main.command()
