@@ -35,6 +35,8 @@ _MODULE_OF = {
     "Solid": "scene",
     "Sun": "scene",
     "Wall": "scene",
+    "Checkpoint": "checkpoint",
+    "load": "load",
     "Characteristic": "transport.characteristic",
     "Jacobi": "iteration",
     "Krylov": "iteration",
@@ -48,7 +50,7 @@ _MODULE_OF = {
     "PerspectiveCamera": "camera",
     "render": "render",
 }
-_SUBMODULES = ("io", "quadrature", "scenes")
+_SUBMODULES = ("io", "quadrature", "scenes", "spectra")
 
 __all__ = ["__version__", *_MODULE_OF, *_SUBMODULES]  # pyright: ignore[reportUnsupportedDunderAll]
 
@@ -56,8 +58,10 @@ if TYPE_CHECKING:
     from raymanifold_jax import io as io
     from raymanifold_jax import quadrature as quadrature
     from raymanifold_jax import scenes as scenes
+    from raymanifold_jax import spectra as spectra
     from raymanifold_jax.camera import OrthographicCamera as OrthographicCamera
     from raymanifold_jax.camera import PerspectiveCamera as PerspectiveCamera
+    from raymanifold_jax.checkpoint import Checkpoint as Checkpoint
     from raymanifold_jax.gather import fluence as fluence
     from raymanifold_jax.gather import irradiance as irradiance
     from raymanifold_jax.gather import outgoing_flux as outgoing_flux
@@ -65,6 +69,7 @@ if TYPE_CHECKING:
     from raymanifold_jax.iteration import Jacobi as Jacobi
     from raymanifold_jax.iteration import Krylov as Krylov
     from raymanifold_jax.lattice import Lattice as Lattice
+    from raymanifold_jax.load import load as load
     from raymanifold_jax.mesh import Mesh as Mesh
     from raymanifold_jax.mesh import MeshReport as MeshReport
     from raymanifold_jax.render import render as render

@@ -256,7 +256,7 @@ def _value_and_slope(coefficients: jax.Array, nodes: jax.Array) -> tuple[jax.Arr
     t = nodes - i
     weight = jnp.stack([0.5 * (0.5 - t) ** 2, 0.75 - t**2, 0.5 * (0.5 + t) ** 2], -1)  # (..., axis, 3)
     rate = jnp.stack([t - 0.5, -2 * t, t + 0.5], -1)
-    strides = np.array([coefficients.shape[1] * coefficients.shape[2], coefficients.shape[2], 1])
+    strides = np.array([coefficients.shape[1] * coefficients.shape[2], coefficients.shape[2], 1], np.int32)
     steps = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3) @ strides
     index = (i.astype(int) * strides).sum(-1)[..., None] + steps
     c = coefficients.reshape(-1)[index].astype(nodes.dtype).reshape(*nodes.shape[:-1], 3, 3, 3)

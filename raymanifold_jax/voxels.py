@@ -26,7 +26,8 @@ from .scene import Solid
 from .shapes import Bounds, Shape, corner_distance, safe_norm
 
 _MARGIN = 2  # free cubes around the mask
-_AROUND = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+# In 32 bits, because JAX keeps constants between 32- and 64-bit modes.
+_AROUND = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3).astype(np.int32)
 
 
 class Voxels(Shape):
@@ -76,7 +77,7 @@ class Voxels(Shape):
         inner = jnp.clip(u, 1.0, jnp.asarray(shape - 1, u.dtype))
         away = safe_norm(u - inner)
         cube = jnp.clip(jnp.floor(inner).astype(int), 1, jnp.asarray(shape - 2))
-        strides = np.array([shape[1] * shape[2], shape[2], 1])
+        strides = np.array([shape[1] * shape[2], shape[2], 1], np.int32)
         around = (cube * strides).sum(-1)[..., None] + _AROUND @ strides
         is_full = self.full.reshape(-1)[around]
         inside = is_full[..., len(_AROUND) // 2]

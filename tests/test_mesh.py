@@ -120,6 +120,7 @@ def test_elements_where_a_mesh_and_a_shape_meet():
         np.testing.assert_allclose(of(found), of(exact), rtol=0.05)
 
 
+@pytest.mark.slow
 def test_same_light_as_the_analytic_ball():
     # The mesh's own error: radius and area of a subdivided icosahedron differ by 0.2 % and 0.5 %.
     def irradiance(shape):

@@ -231,23 +231,37 @@ def test_what_files_cannot_hold(tmp_path):
     assert not (tmp_path / "a.toml").exists()
 
 
+def test_a_sky_image_is_seen_the_right_way_round(tmp_path):
+    # As panoramas are: the zenith on top, azimuth (from +x towards +y, seen from above) growing to the left.
+    image = np.zeros((8, 16, 3), np.float32)
+    image[2:4, 12] = (
+        1.0  # a quarter turn before the seam: column 12.5 of 16 from the right is azimuth (16 - 12.5) / 16 of a turn
+    )
+    rm.io.write_exr(tmp_path / "sky.exr", image)
+    scene: Any = load(tmp_path, SMALL + "[[lights]]\nkind = 'sky'\nimage = 'sky.exr'\nradiance = [1, 2, 3]\n").scene
+    azimuth, polar = 2 * np.pi * 3.5 / 16, np.pi * 3 / 8
+    towards = np.array([[np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]])
+    np.testing.assert_allclose(scene.lights[0].radiance_along(-towards), [[1, 2, 3]], rtol=1e-5)
+    np.testing.assert_allclose(scene.lights[0].radiance_along(-towards * [1, -1, 1]), 0, atol=1e-6)
+
+
 # On the command line
 
 
 def test_init_and_render(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("RAYMANIFOLD_CACHE", "")
+    monkeypatch.setattr(cli, "_use_cache", lambda: None)
     run = CliRunner()
     assert run.invoke(cli.main, ["init"]).exit_code == 0
     again = run.invoke(cli.main, ["init"])
     assert again.exit_code == 2 and "which is there" in again.output
     assert run.invoke(cli.main, ["init", "--force"]).exit_code == 0
     assert run.invoke(cli.main, ["init", "scene.txt"]).exit_code == 2
-    options = ["--size", "8", "--directions", "48", "--resolution", "16x12", "--samples", "1", "--quiet"]
+    options = ["--size", "6", "--directions", "24", "--resolution", "8x6", "--samples", "1", "--quiet"]
     done = run.invoke(cli.main, ["render", "scene.toml", *options])
     assert done.exit_code == 0, done.output
     image, _, header = rm.io.read_exr("scene.exr")
-    assert image.shape == (12, 16, 3) and image.max() > 0 and header["raymanifold.scene"] == "scene"
+    assert image.shape == (6, 8, 3) and image.max() > 0 and header["raymanifold.scene"] == "scene"
 
 
 def test_a_mistake_is_one_line(tmp_path):
