@@ -20,6 +20,10 @@ _MODULE_OF = {
     "Shape": "shapes",
     "Sphere": "shapes",
     "Torus": "shapes",
+    "Mesh": "mesh",
+    "MeshReport": "mesh",
+    "Voxels": "voxels",
+    "voxel_solids": "voxels",
     "MIRROR": "scene",
     "OPEN": "scene",
     "PERIODIC": "scene",
@@ -31,6 +35,8 @@ _MODULE_OF = {
     "Solid": "scene",
     "Sun": "scene",
     "Wall": "scene",
+    "Checkpoint": "checkpoint",
+    "load": "load",
     "Characteristic": "transport.characteristic",
     "LightRayCube": "transport.light_ray_cube",
     "CostReport": "cost",
@@ -47,7 +53,7 @@ _MODULE_OF = {
     "PerspectiveCamera": "camera",
     "render": "render",
 }
-_SUBMODULES = ("io", "quadrature", "scenes")
+_SUBMODULES = ("io", "quadrature", "scenes", "spectra")
 
 __all__ = ["__version__", *_MODULE_OF, *_SUBMODULES]  # pyright: ignore[reportUnsupportedDunderAll]
 
@@ -55,8 +61,10 @@ if TYPE_CHECKING:
     from raymanifold_jax import io as io
     from raymanifold_jax import quadrature as quadrature
     from raymanifold_jax import scenes as scenes
+    from raymanifold_jax import spectra as spectra
     from raymanifold_jax.camera import OrthographicCamera as OrthographicCamera
     from raymanifold_jax.camera import PerspectiveCamera as PerspectiveCamera
+    from raymanifold_jax.checkpoint import Checkpoint as Checkpoint
     from raymanifold_jax.cost import CostReport as CostReport
     from raymanifold_jax.cost import cost_report as cost_report
     from raymanifold_jax.gather import fluence as fluence
@@ -66,6 +74,9 @@ if TYPE_CHECKING:
     from raymanifold_jax.iteration import Jacobi as Jacobi
     from raymanifold_jax.iteration import Krylov as Krylov
     from raymanifold_jax.lattice import Lattice as Lattice
+    from raymanifold_jax.load import load as load
+    from raymanifold_jax.mesh import Mesh as Mesh
+    from raymanifold_jax.mesh import MeshReport as MeshReport
     from raymanifold_jax.render import render as render
     from raymanifold_jax.scene import MIRROR as MIRROR
     from raymanifold_jax.scene import OPEN as OPEN
@@ -88,6 +99,8 @@ if TYPE_CHECKING:
     from raymanifold_jax.solve import solve as solve
     from raymanifold_jax.transport.characteristic import Characteristic as Characteristic
     from raymanifold_jax.transport.light_ray_cube import LightRayCube as LightRayCube
+    from raymanifold_jax.voxels import Voxels as Voxels
+    from raymanifold_jax.voxels import voxel_solids as voxel_solids
 
 
 def __getattr__(name: str) -> Any:

@@ -1,4 +1,4 @@
-"""The command line: `raymanifold render`, `solve`, `scenes`, `info`, `cost`.
+"""The command line: `raymanifold render`, `solve`, `init`, `scenes`, `info`, `cost`.
 
 Only click is imported here: everything heavy is loaded inside the commands, so that `--help` answers at once. All
 option values are checked before any work. Exit codes: 0; 1 where a solve did not converge (its pictures are written
@@ -11,14 +11,27 @@ import math
 import os
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from . import __version__
+from .cli_options import (
+    Elements,
+    Exposure,
+    Resolution,
+    SceneName,
+    check_writable,
+    checked,
+    lattice_options,
+    one_line_errors,
+    output,
+    scene_argument,
+    solve_options,
+    with_options,
+)
 
 if TYPE_CHECKING:
     import numpy as np
@@ -28,153 +41,7 @@ if TYPE_CHECKING:
     from .solution import Solution
 
 _BRIGHT, _BRIGHT_SHARE = 0.9, 99.0  # auto exposure: this percentile of the radiance becomes this much of white
-_LARGEST_PICTURE = 16384  # pixels a side
-_FEWEST_DIRECTIONS = 24  # with fewer, the six faces of the sweep get no more than a few each
 _CACHED_FROM = 0.2  # seconds: programs that compile faster are not kept
-
-
-class _SceneName(click.ParamType):
-    name = "scene"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> "SceneEntry":
-        from .scenes import find
-
-        try:
-            return find(value)
-        except ValueError as error:
-            self.fail(str(error), param, ctx)
-
-
-class _Resolution(click.ParamType):
-    name = "resolution"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        parts = str(value).lower().split("x")
-        sides = [int(part) if part.isascii() and part.isdigit() and len(part) < 10 else 0 for part in parts]
-        if not (len(sides) in (1, 2) and all(1 <= side <= _LARGEST_PICTURE for side in sides)):
-            expected = f"expected pixels from 1 to {_LARGEST_PICTURE}"
-            self.fail(f"got {value!r}, {expected}; write 640x480, or 512 for a square", param, ctx)
-        return sides[0], sides[-1]
-
-
-class _Elements(click.ParamType):
-    name = "elements"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        parts = str(value).lower().split("x")
-        sides = [int(part) if part.isascii() and part.isdigit() and len(part) < 10 else 0 for part in parts]
-        if not (len(sides) == 2 and min(sides) >= 1):
-            self.fail(f"got {value!r}, expected elements along u and v; write 64x32", param, ctx)
-        return sides[0], sides[1]
-
-
-class _Exposure(click.ParamType):
-    name = "exposure"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float | None:
-        """Stops; None is auto."""
-        if str(value).lower() == "auto":
-            return None
-        try:
-            stops = float(value)
-        except ValueError:
-            stops = math.nan
-        if not abs(stops) <= 100:
-            self.fail(f"got {value!r}, expected stops from -100 to 100; write -1 to halve, or auto", param, ctx)
-        return stops
-
-
-def _checked(valid: Callable[[Any], bool], expected: str, advice: str) -> Callable[..., Any]:
-    """A click callback that refuses values which are not `valid`."""
-
-    def check(ctx: click.Context, param: click.Parameter, value: Any) -> Any:
-        if value is not None and not valid(value):
-            raise click.BadParameter(f"got {value}, expected {expected}; {advice}", ctx, param)
-        return value
-
-    return check
-
-
-def _output(ctx: click.Context, param: click.Parameter, path: Path | None) -> Path | None:
-    if path is None:
-        return None
-    if path.suffix.lower() != ".exr":
-        got = f"got {str(path)!r}, expected a name that ends in .exr"
-        raise click.BadParameter(f"{got}; write {str(path) + '.exr'!r}, a .png appears beside it", ctx, param)
-    for target in (path, path.with_suffix(".png")):
-        _check_writable(target, ctx, param)
-    return path
-
-
-def _check_writable(path: Path, ctx: click.Context, param: click.Parameter | None = None) -> None:
-    folder, advice = path.parent, "make it first, or write elsewhere"
-    try:
-        if not folder.is_dir():
-            raise click.BadParameter(f"got {str(path)!r}, expected a directory that exists; {advice}", ctx, param)
-        if not os.access(folder, os.W_OK | os.X_OK):
-            advice = "choose another with --out"
-            raise click.BadParameter(f"got {str(path)!r}, expected a directory you may write in; {advice}", ctx, param)
-        if path.exists() and not path.is_file():
-            raise click.BadParameter(f"got {str(path)!r}, expected a file; something else has that name", ctx, param)
-    except OSError as error:  # a name too long, a directory that may not be entered
-        raise click.BadParameter(f"got {str(path)!r}: {error.strerror}; choose another name", ctx, param) from error
-
-
-_scene = click.argument("scene", type=_SceneName(), metavar="SCENE")
-_lattice_options = (
-    click.option(
-        "--size",
-        type=int,
-        metavar="N",
-        callback=_checked(lambda n: n >= 4, "a whole number >= 4", "64 is quick, 128 fine"),
-        help="Voxels a side. [default: the scene's own]",
-    ),
-    click.option(
-        "--directions",
-        type=int,
-        metavar="N",
-        default=200,
-        show_default=True,
-        callback=_checked(
-            lambda n: _FEWEST_DIRECTIONS <= n <= 1_000_000,
-            f"a whole number from {_FEWEST_DIRECTIONS} to 1000000",
-            "200 is often enough",
-        ),
-        help="Directions of the sweeps.",
-    ),
-)
-_solve_options = (
-    *_lattice_options,
-    click.option(
-        "--rtol",
-        type=float,
-        metavar="X",
-        default=1e-3,
-        show_default=True,
-        callback=_checked(lambda x: 0 < x < 1, "a number between 0 and 1", "1e-3 is fine for pictures"),
-        help="Certified error bound to reach, relative to the largest radiosity.",
-    ),
-    click.option(
-        "--max-sweeps",
-        type=int,
-        metavar="N",
-        default=1000,
-        show_default=True,
-        callback=_checked(lambda n: n >= 1, "a whole number >= 1", "leave it out for 1000"),
-        help="Stop there at the latest.",
-    ),
-    click.option("--quiet", is_flag=True, help="Print nothing but warnings and errors."),
-    click.option("--no-progress", is_flag=True, help="No progress bar."),
-)
-
-
-def _with(options: Sequence[Callable[..., Any]]) -> Callable[..., Any]:
-    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        for option in reversed(options):
-            function = option(function)
-        return function
-
-    return decorate
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -187,18 +54,18 @@ def main() -> None:
 
 
 @main.command()
-@_scene
+@scene_argument
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
-    callback=_output,
+    callback=output,
     metavar="FILE.exr",
     help="The OpenEXR file; a PNG appears beside it. [default: SCENE.exr]",
 )
 @click.option("--camera", metavar="NAME", help="The view: `raymanifold scenes` lists them. [default: the first]")
 @click.option("--all-views", is_flag=True, help="All of the scene's views, as FILE-VIEW.exr.")
 @click.option(
-    "--resolution", type=_Resolution(), default="512", metavar="WxH", show_default=True, help="Pixels: 640x480, or 512."
+    "--resolution", type=Resolution(), default="512", metavar="WxH", show_default=True, help="Pixels: 640x480, or 512."
 )
 @click.option(
     "--samples",
@@ -206,21 +73,21 @@ def main() -> None:
     metavar="N",
     default=4,
     show_default=True,
-    callback=_checked(
+    callback=checked(
         lambda n: 1 <= n <= 1024 and math.isqrt(n) ** 2 == n, "a square number from 1 to 1024", "4 or 16 are good"
     ),
     help="Rays a pixel: 1, 4, 9, ...",
 )
 @click.option(
     "--exposure",
-    type=_Exposure(),
+    type=Exposure(),
     metavar="STOPS",
     default="auto",
     show_default=True,
     help=f"Of the PNG: stops, or auto, which takes the {_BRIGHT_SHARE:g}th percentile to {_BRIGHT} of white (linear).",
 )
 @click.option("--half", is_flag=True, help="Store 16-bit floats.")
-@_with(_solve_options)
+@with_options(solve_options)
 @click.pass_context
 def render(
     ctx: click.Context,
@@ -234,7 +101,7 @@ def render(
     half: bool,
     **settings: Any,
 ) -> None:
-    """Solve SCENE (ring, three-balls or room) and write pictures of it."""
+    """Solve SCENE (ring, three-balls, room or a file.toml) and write pictures of it."""
     if camera is not None and all_views:
         raise click.UsageError("--camera and --all-views exclude each other; leave one out", ctx)
     if camera is not None and camera not in scene.views:
@@ -245,13 +112,11 @@ def render(
     files = {view: out.with_stem(f"{out.stem}-{view}") if all_views else out for view in wanted}
     for file in files.values():
         for target in (file, file.with_suffix(".png")):
-            _check_writable(target, ctx)
+            check_writable(target, ctx)
     size = settings["size"] or scene.default_size
-    with _one_line_errors():
+    with one_line_errors():
         built = _build(scene, size, settings["directions"])
-        from .scenes import cameras
-
-        views = cameras(scene.name, built, resolution)
+        views = {view: make(built.lattice, resolution) for view, make in scene.views.items()}
         solution, seconds = _solve(built, **settings)
 
         import raymanifold_jax as rm
@@ -277,12 +142,12 @@ def render(
 
 
 @main.command()
-@_scene
-@_with(_solve_options)
+@scene_argument
+@with_options(solve_options)
 @click.pass_context
 def solve(ctx: click.Context, scene: "SceneEntry", **settings: Any) -> None:
-    """Solve SCENE (ring, three-balls or room) and print where its light goes."""
-    with _one_line_errors():
+    """Solve SCENE (ring, three-balls, room or a file.toml) and print where its light goes."""
+    with one_line_errors():
         built = _build(scene, settings["size"] or scene.default_size, settings["directions"])
         solution, seconds = _solve(built, **settings)
     if not settings["quiet"]:
@@ -291,6 +156,27 @@ def solve(ctx: click.Context, scene: "SceneEntry", **settings: Any) -> None:
         for name, value in solution.energy._asdict().items():
             _line(f"  {name.replace('_', ' ')}", f"{float(value):.6g}")
     _warn_unless_converged(ctx, solution)
+
+
+@main.command()
+@click.argument("file", type=click.Path(path_type=Path), default="scene.toml", metavar="[FILE.toml]")
+@click.option("--force", is_flag=True, help="Replace a file that is there.")
+@click.pass_context
+def init(ctx: click.Context, file: Path, force: bool) -> None:
+    """Write a commented scene file to start from. [default: scene.toml]"""
+    from .io.exr import written_atomically
+    from .io.scene_writer import EXAMPLE
+
+    if file.suffix.lower() != ".toml":
+        raise click.UsageError(
+            f"FILE: got {str(file)!r}, expected a name that ends in .toml; write {str(file) + '.toml'!r}", ctx
+        )
+    check_writable(file, ctx)
+    if file.exists() and not force:
+        raise click.UsageError(f"FILE: got {str(file)!r}, which is there; expected a new name; --force replaces it", ctx)
+    with one_line_errors(), written_atomically(file) as temporary:
+        temporary.write_text(EXAMPLE, encoding="utf-8")
+    _line("wrote", f"{file}; next: raymanifold render {file}")
 
 
 @main.command()
@@ -304,8 +190,8 @@ def scenes() -> None:
 
 
 @main.command()
-@click.argument("scene", type=_SceneName(), metavar="[SCENE]", required=False)
-@_with(_lattice_options)
+@click.argument("scene", type=SceneName(), metavar="[SCENE]", required=False)
+@with_options(lattice_options)
 def info(scene: "SceneEntry | None", size: int | None, directions: int) -> None:
     """Versions, devices, and the memory that SCENE (or every scene) needs against what there is."""
     cache = _use_cache()
@@ -325,7 +211,7 @@ def info(scene: "SceneEntry | None", size: int | None, directions: int) -> None:
     available = available_memory()
     _line("memory available", "unknown" if available is None else gigabytes(available))
     for entry in SCENES.values() if scene is None else [scene]:
-        with _one_line_errors():
+        with one_line_errors():
             built = entry.build(size or entry.default_size)
         shape = built.lattice.shape
         need = estimate_memory(shape, built.bands, directions, built.medium is not None)
@@ -334,22 +220,22 @@ def info(scene: "SceneEntry | None", size: int | None, directions: int) -> None:
 
 
 @main.command()
-@_scene
+@scene_argument
 @click.option(
     "--size",
     type=int,
     metavar="N",
-    callback=_checked(lambda n: n >= 4, "a whole number >= 4", "128 is the paper's"),
+    callback=checked(lambda n: n >= 4, "a whole number >= 4", "128 is the paper's"),
     help="Voxels a side. [default: the scene's own]",
 )
-@click.option("--pe", type=_Elements(), default="64x32", metavar="AxB", show_default=True, help="Processing elements.")
+@click.option("--pe", type=Elements(), default="64x32", metavar="AxB", show_default=True, help="Processing elements.")
 @click.option(
     "--half-width",
     type=int,
     metavar="M",
     default=5,
     show_default=True,
-    callback=_checked(lambda m: 1 <= m <= 64, "a whole number from 1 to 64", "5 is the paper's"),
+    callback=checked(lambda m: 1 <= m <= 64, "a whole number from 1 to 64", "5 is the paper's"),
     help="Of the light ray cube.",
 )
 @click.option("--characteristic", is_flag=True, help="The characteristic scheme, with 200 directions, in place of the paper's.")
@@ -358,7 +244,7 @@ def cost(scene: "SceneEntry", size: int | None, pe: tuple[int, int], half_width:
     import raymanifold_jax as rm
 
     scheme = rm.Characteristic() if characteristic else rm.LightRayCube(half_width)
-    with _one_line_errors():
+    with one_line_errors():
         click.echo(str(rm.cost_report(scene.build(size or scene.default_size), scheme, pe)))
 
 
@@ -373,22 +259,37 @@ def _build(entry: "SceneEntry", size: int, directions: int) -> "Scene":
 
 
 def _solve(
-    scene: "Scene", directions: int, rtol: float, max_sweeps: int, quiet: bool, no_progress: bool, **_: Any
+    scene: "Scene",
+    directions: int,
+    rtol: float,
+    max_sweeps: int,
+    quiet: bool,
+    no_progress: bool,
+    checkpoint: Path | None,
+    resume: bool,
+    save: Path | None,
+    **_: Any,
 ) -> tuple["Solution", float]:
     """The solution, and the seconds it took."""
     import jax
 
     import raymanifold_jax as rm
 
+    if resume and checkpoint is None:
+        raise ValueError("--resume: got no checkpoint, expected --checkpoint FILE as well; name the file to go on from")
     began = time.perf_counter()
+    options: dict[str, Any] = {} if checkpoint is None else {"checkpoint": rm.Checkpoint(checkpoint, resume=resume)}
     solution = rm.solve(
         scene,
         quadrature=rm.quadrature.fibonacci(directions),
         rtol=rtol,
         max_sweeps=max_sweeps,
         progress=not (quiet or no_progress),
+        **options,
     )
     jax.block_until_ready(solution.diffuse_fluence)
+    if save is not None:
+        solution.save(save)
     return solution, time.perf_counter() - began
 
 
@@ -446,27 +347,6 @@ def _warn_unless_converged(ctx: click.Context, solution: "Solution") -> None:
     if not solution.converged:
         click.secho(f"Warning: {solution.result}", err=True, fg="red", bold=True)
         ctx.exit(1)
-
-
-def _failure(error: BaseException, exit_code: int) -> click.ClickException:
-    failure = click.ClickException(" ".join(str(error).split()) or type(error).__name__)
-    vars(failure)["exit_code"] = exit_code  # a class variable by its declaration
-    return failure
-
-
-@contextmanager
-def _one_line_errors() -> Iterator[None]:
-    """What the library refuses, and what the machine cannot do, in one line."""
-    try:
-        yield
-    except ValueError as error:
-        raise _failure(error, 2) from error
-    except (MemoryError, OSError) as error:
-        raise _failure(error, 1) from error
-    except RuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):  # XLA's word for out of memory
-            raise
-        raise _failure(error, 1) from error
 
 
 def _cache_directory(environment: Mapping[str, str]) -> str | None:

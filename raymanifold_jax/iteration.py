@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .checkpoint import Checkpoint
 from .direct import Direct
 from .operator import Light, Materials, Transport
 from .progress import Progress
@@ -102,6 +103,25 @@ class Iteration:
         self._scale = max(self.residuals[0], float(jnp.max(system.materials.emission, initial=0.0)))
         self.target = rtol * self._scale
         self._rtol, self._most, self._meter = rtol, most, meter
+        self.lost = self.arriving  # the low bits of Jacobi's sum
+        self.checkpoint: Checkpoint | None = None
+
+    def _state(self) -> tuple:
+        return self.arriving, self.residual, self.lost, np.array(self.residuals), np.array(self.target)
+
+    def resume(self, checkpoint: Checkpoint) -> None:
+        """Save the state to a checkpoint from now on, and go on from what it holds."""
+        self.checkpoint = checkpoint
+        found = checkpoint.restore((self.system.source, self.system.materials, self._rtol), self._state())
+        if found is not None:
+            arriving, residual, lost, residuals, target = found
+            self.arriving, self.residual, self.lost = jax.tree.map(jnp.asarray, (arriving, residual, lost))
+            self.residuals, self.target = [float(r) for r in residuals], float(target)
+
+    def keep(self) -> None:
+        """A place from which to go on: save the state if it is time."""
+        if self.checkpoint is not None:
+            self.checkpoint.keep(self._state())
 
     @property
     def bound(self) -> float:
@@ -138,11 +158,11 @@ class Jacobi(eqx.Module):
     """
 
     def run(self, iteration: Iteration) -> None:
-        lost = iteration.arriving
         while not iteration.over:
             order, iteration.residual = iteration.system.bounce(iteration.residual)
-            iteration.arriving, lost = _add(iteration.arriving, lost, order)
+            iteration.arriving, iteration.lost = _add(iteration.arriving, iteration.lost, order)
             iteration.note(float(iteration.residual.largest()), float(_largest(iteration.system, iteration.arriving)))
+            iteration.keep()
 
 
 @eqx.filter_jit
@@ -161,6 +181,7 @@ class Krylov(eqx.Module):
     def run(self, iteration: Iteration) -> None:
         while not iteration.over:
             self._cycle(iteration)
+            iteration.keep()
 
     def _cycle(self, iteration: Iteration) -> None:
         system, start, begun = iteration.system, iteration.residual, iteration.arriving

@@ -9,7 +9,7 @@ All fill the unit cube, z up, with n voxels a side:
 `SCENES` lists them by name, with a size to start from and their views; `cameras` makes a scene's views at a resolution.
 Walls are seen from inside only, so a camera outside looks through the wall in front of it.
 
-Public names: `ring`, `three_balls_in_fog`, `room`, `SCENES`, `SceneEntry`, `find`, `cameras`.
+Public names: `ring`, `three_balls_in_fog`, `room`, `SCENES`, `SceneEntry`, `find`, `cameras`, `STANDARD_VIEWS`.
 """
 
 import difflib
@@ -183,6 +183,9 @@ _FROM_FOUR_SIDES: dict[str, View] = {
     side: partial(_oblique, azimuth, 50.0)
     for side, azimuth in {"south": -90.0, "east": 0.0, "north": 90.0, "west": 180.0}.items()
 }
+
+#: Views of any scene: from four sides and from above.
+STANDARD_VIEWS: Mapping[str, View] = MappingProxyType({**_FROM_FOUR_SIDES, "top": _top})
 
 #: The scenes by name.
 SCENES: Mapping[str, SceneEntry] = MappingProxyType(

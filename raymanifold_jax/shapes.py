@@ -14,7 +14,7 @@ computes in the dtype of its points, and has a finite gradient everywhere (of le
 is unique and shorter, down to 0, where it is not: at a sphere's centre, on an edge).
 
 Public names: `Shape`, `Sphere`, `Box`, `Torus`, `Cylinder`, `HalfSpace`, `Union`, `Intersection`, `Difference`,
-`Translated`, `Rotated`, `safe_norm`.
+`Translated`, `Rotated`; `safe_norm`, `corner_distance` for this package.
 """
 
 import abc
@@ -112,7 +112,7 @@ class Box(Shape):
 
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         points, lower, upper = _cast(points, self.lower, self.upper)
-        return _corner_distance(jnp.abs(points - (lower + upper) / 2) - (upper - lower) / 2)
+        return corner_distance(jnp.abs(points - (lower + upper) / 2) - (upper - lower) / 2)
 
     def bounds(self) -> Bounds:
         return np.asarray(self.lower), np.asarray(self.upper)
@@ -167,7 +167,7 @@ class Cylinder(Shape):
         points, start, end, radius = _cast(points, self.start, self.end, self.radius)
         length = safe_norm(end - start)
         radial, height = _cylindrical(points - (start + end) / 2, (end - start) / length)
-        return _corner_distance(jnp.stack([radial - radius, jnp.abs(height) - length / 2], axis=-1))
+        return corner_distance(jnp.stack([radial - radius, jnp.abs(height) - length / 2], axis=-1))
 
     def bounds(self) -> Bounds:
         start, end = np.asarray(self.start), np.asarray(self.end)
@@ -286,10 +286,14 @@ class Rotated(Shape):
         turned = along + (arm - along) * jnp.cos(angle) - jnp.cross(axis, arm) * jnp.sin(angle)
         return self.shape.distance(turned + center)
 
+    def matrix(self) -> Float[np.ndarray, "3 3"]:
+        """The rotation: points turn by x -> matrix @ (x - center) + center."""
+        cross = np.cross(np.eye(3), np.asarray(self.axis))  # cross @ v is axis x v
+        angle = np.asarray(self.angle)
+        return np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+
     def bounds(self) -> Bounds:
-        axis, angle, center = np.asarray(self.axis), np.asarray(self.angle), np.asarray(self.center)
-        cross = np.cross(np.eye(3), axis)  # cross @ v is axis x v
-        matrix = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
+        center, matrix = np.asarray(self.center), self.matrix()
         matrix = np.where(np.abs(matrix) < 1e-12, 0, matrix)  # a quarter turn keeps an infinite side to its axis
         lower, upper = self.shape.bounds()
         ends = np.stack([lower - center, upper - center])
@@ -326,7 +330,7 @@ def _across(axis: Any) -> np.ndarray:
     return np.sqrt(np.maximum(1 - np.asarray(axis) ** 2, 0))
 
 
-def _corner_distance(excess: jax.Array) -> jax.Array:
+def corner_distance(excess: jax.Array) -> jax.Array:
     # Distance to a convex corner of planes, from how far the point is beyond each plane.
     inside = jnp.max(excess, axis=-1)
     # Not the usual sum of an outside and an inside term: on a face that would halve the gradient.

@@ -6,7 +6,9 @@ Public: `Solution`, `SurfaceTable`, `Energy`.
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+import os
+from html import escape
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -92,6 +94,33 @@ class Solution(eqx.Module):
     converged: bool = eqx.field(static=True)
     stagnated: bool = eqx.field(static=True)
     _hidden: _Hidden = eqx.field(static=True)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the solution and its scene to a file that `rm.load` reads; whole, or the old one stays.
+
+        **Raises** `ValueError` for a scene with a sky that is a function; `FileNotFoundError` if the directory is missing.
+        """
+        from .io.archive import save_solution
+
+        save_solution(path, self)
+
+    def plot(self, at: Any = None) -> Any:
+        """A matplotlib figure: planes of fluence through `at`, light on surfaces, convergence (`plots`)."""
+        from .plots import plot_solution
+
+        return plot_solution(self, at)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        energy = {name.replace("_", " "): float(value) for name, value in self.energy._asdict().items()}
+        rows = {"scene": self.scene.summary(), "result": self.result}
+        rows |= {f"{name}, W": f"{value:.6g}" for name, value in energy.items()}
+        rows["imbalance"] = f"{100 * float(self.energy.imbalance):+.3f} %"
+        cells = (
+            f"<tr><th style='text-align:left'>{k}</th><td style='text-align:left'>{escape(v)}</td></tr>"
+            for k, v in rows.items()
+        )
+        return f"<table>{''.join(cells)}</table>"
 
     @property
     def elements(self) -> Surfaces:

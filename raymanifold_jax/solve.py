@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import checks
+from .checkpoint import Checkpoint
 from .direct import first_flight, sky_radiance
 from .iteration import Iteration, Jacobi, Krylov, System, certify
 from .layout import make_layout
@@ -43,6 +44,7 @@ def solve(
     throw: bool = False,
     progress: bool | Progress | None = None,
     mesh: None = None,
+    checkpoint: Checkpoint | None = None,
 ) -> Solution:
     """Solve a scene for the light everywhere.
 
@@ -57,11 +59,12 @@ def solve(
     - `max_sweeps`: the iteration stops there at the latest. With `Jacobi`, k of them are k of the paper's iterations: light
       straight from the sources, and k bounces. With `throw`, that raises `RuntimeError`; without, read
       `Solution.converged` and `Solution.result`.
+    - `checkpoint`: an `rm.Checkpoint`, in which the iteration keeps its state, and from which it may go on.
     - `progress`: True or None shows a bar on a terminal when the solve takes long; False never; or a `Progress`.
 
     **Raises** `ValueError` or `TypeError` for unusable arguments before any work, `RuntimeError` with `throw`.
     """
-    _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh)
+    _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint)
     cube = scheme if isinstance(scheme, LightRayCube) else None
     quadrature = fibonacci(_DEFAULT_DIRECTIONS) if quadrature is None else quadrature
     check_memory(scene.lattice.shape, scene.bands, len(quadrature), scene.medium is not None)
@@ -78,6 +81,8 @@ def solve(
             transport = make_transport(layout, quadrature, stuff.extinction, scene.bands, area=surfaces.area)
             system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff))
         iteration = Iteration(system, certify(system), float(rtol), max_sweeps, meter)
+        if checkpoint is not None:
+            iteration.resume(checkpoint)
         automatic = Krylov() if nodes is None else Jacobi()
         (automatic if isinstance(solver, str) else solver).run(iteration)
         solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes)
@@ -86,7 +91,7 @@ def solve(
     return solution
 
 
-def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh) -> None:
+def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint) -> None:
     checks.instance("scene", scene, Scene, "make one with rm.Scene(lattice, solids=[...], ...)")
     if quadrature is not None:
         checks.instance("quadrature", quadrature, Quadrature, "use rm.quadrature.fibonacci(200)")
@@ -102,6 +107,8 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh) 
         checks.fail("solver", repr(solver), 'rm.Jacobi(), rm.Krylov() or "auto"', 'leave it at "auto"')
     if mesh is not None:
         checks.fail("mesh", repr(mesh), "None", "sweeps run on one device so far; leave mesh out")
+    if checkpoint is not None:
+        checks.instance("checkpoint", checkpoint, Checkpoint, 'pass rm.Checkpoint("run.npz")')
     checks.positive_int("max_sweeps", max_sweeps)
     finest = 16 * float(jnp.finfo(jnp.zeros(0).dtype).eps)
     if not (isinstance(rtol, (int, float, np.floating)) and math.isfinite(rtol) and finest <= rtol < 1):

@@ -12,13 +12,15 @@ Public: `Surfaces`, `find_surfaces`, `patch_points`.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .lattice import Lattice
+from .mesh_elements import mesh_elements, triangles_of
 from .scene import OPEN, Scene, Wall
 
 #: Cosine between the normals of neighbouring points of one face: a sharper edge parts two faces, each an element of its own.
@@ -26,6 +28,7 @@ _SAME_FACE = 0.9
 _FACES = 6  # faces told apart in a voxel, at most
 #: Points this far behind a face (voxels) decide which voxel owns it: the one on the solid side.
 _INWARD = 1e-3
+_NEAR = 0.5 * np.sqrt(3) + 0.1  # voxels: centres this near to a surface may have it in their voxel
 _PATCH = 8  # samples a side on an element's plane
 _BATCH = 1 << 15  # voxels analysed at once
 
@@ -94,10 +97,10 @@ def _no_elements() -> dict[str, np.ndarray]:
 class _DistanceField:
     """The solids' signed distance and its gradient in voxels, at points in scene units, in batches."""
 
-    def __init__(self, scene: Scene):
+    def __init__(self, scene: Scene, which: Sequence[int] | None = None):
         self.spacing = scene.lattice.spacing
         # The shapes alone: albedos may be traced while a scene is being fitted, its geometry never is.
-        self._shapes = tuple(solid.shape for solid in scene.solids)
+        self._shapes = tuple(scene.solids[i].shape for i in (range(len(scene.solids)) if which is None else which))
 
         def distances(shapes, x):
             return jnp.stack([s.distance(x) for s in shapes])
@@ -135,23 +138,40 @@ class _DistanceField:
 def _solid_elements(scene: Scene, field: _DistanceField, distance: np.ndarray) -> dict[str, np.ndarray]:
     """Elements of the solids' surfaces in the lattice's voxels."""
     lattice = scene.lattice
-    candidates = np.argwhere(np.abs(distance) < 0.5 * np.sqrt(3) + 0.1)
+    near = np.abs(distance) < _NEAR
+    meshes = {i: corners for i, solid in enumerate(scene.solids) if (corners := triangles_of(solid.shape)) is not None}
+    if meshes:  # closed meshes bring their own elements
+        others = [i for i in range(len(scene.solids)) if i not in meshes]
+        near &= np.abs(_DistanceField(scene, others).distance(lattice.centers())) < _NEAR if others else False
+    candidates = np.argwhere(near)
     found = [
         _faces(scene, field, candidates[i : i + _BATCH], distance[tuple(candidates[i : i + _BATCH].T)])
         for i in range(0, len(candidates), _BATCH)
     ]
+    for rows in found:
+        rows["material"] = field.nearest(_position(lattice, rows)).astype(int)
+    if meshes:
+        found = [{key: value[~np.isin(f["material"], [*meshes])] for key, value in f.items()} for f in found]
+    for number, corners in meshes.items():
+        others = [i for i in range(len(scene.solids)) if i != number]
+        rows = mesh_elements(lattice, corners, _DistanceField(scene, others).distance if others else None)
+        found.append({**rows, "material": np.full(len(rows["area"]), number)})
     if not found:
         return _no_elements()
     joined = {key: np.concatenate([f[key] for f in found]) for key in found[0]}
-    center = lattice.lower + (joined["voxel"] + 0.5) * lattice.spacing
-    position = center + joined.pop("centroid") * lattice.spacing
-    material = field.nearest(position).astype(int)
+    position = _position(lattice, joined)
+    del joined["centroid"]
     joined["area"] = joined["area"] * lattice.spacing**2
     # The underside of a solid that stands on a side of the domain faces out of it: no surface of this scene.
     ahead = position + 0.02 * lattice.spacing * joined["normal"]
     beyond = ((ahead < lattice.lower) | (ahead > lattice.upper)) & ~np.array(scene.boundary.periodic)
-    rows = {**joined, "position": position, "material": material}
+    rows = {**joined, "position": position}
     return _elements({key: value[~beyond.any(1)] for key, value in rows.items()}, side=-1, is_open=False)
+
+
+def _position(lattice: Lattice, rows: dict[str, np.ndarray]) -> np.ndarray:
+    """Middles of elements in scene units."""
+    return lattice.lower + (rows["voxel"] + 0.5 + rows["centroid"]) * lattice.spacing
 
 
 def _faces(scene: Scene, field: _DistanceField, voxels: np.ndarray, distance: np.ndarray) -> dict[str, np.ndarray]:
