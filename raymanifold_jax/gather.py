@@ -243,8 +243,10 @@ def _sunlit(scene: Scene, points: Array, back: Array, towards: Array) -> Float[A
     if scene.medium is None:
         return jnp.broadcast_to(lit[:, None], (len(points), scene.bands)).astype(points.dtype)
     spacing = scene.lattice.spacing
-    reach = jnp.where(lit, hit.distance, 0.0) / spacing
-    enter = jnp.where(lit, hit.enter, 0.0) / spacing
+    # A point on a solid that stands out of an open side is outside already: nothing is on the way.
+    inside = lit & jnp.isfinite(hit.distance)
+    reach = jnp.where(inside, hit.distance, 0.0) / spacing
+    enter = jnp.where(inside, hit.enter, 0.0) / spacing
     passed = transmittance_between(scene, to_voxel(scene, points), sloped(back), enter, jnp.maximum(reach, enter))
     return jnp.where(lit[:, None], passed, 0.0)
 

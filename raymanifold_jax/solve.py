@@ -24,7 +24,7 @@ from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
 from .progress import Progress, make_progress
 from .quadrature import Quadrature, fibonacci
-from .scene import OPEN, PointLight, Scene, Sun
+from .scene import OPEN, PointLight, Scene, Sky, Sun
 from .solution import Energy, Solution, _Hidden
 from .surfaces import Surfaces, find_surfaces
 from .transport.characteristic import Characteristic
@@ -78,7 +78,7 @@ def solve(
             system, quadrature = nodes.system, nodes.quadrature
         else:
             layout = make_layout(scene, surfaces)
-            transport = make_transport(layout, quadrature, stuff.extinction, scene.bands, area=surfaces.area)
+            transport = make_transport(layout, quadrature, stuff.extinction, scene.bands, area=surfaces.area if _exchanges(scene, stuff) else None)
             system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff))
         iteration = Iteration(system, certify(system), float(rtol), max_sweeps, meter)
         if checkpoint is not None:
@@ -89,6 +89,12 @@ def solve(
     if throw and not solution.converged:
         raise RuntimeError(f"solve: {solution.result}")
     return solution
+
+
+def _exchanges(scene: Scene, stuff: Materials) -> bool:
+    """Whether anything sends light through the sweeps of the solve: else nothing needs balancing."""
+    fields = (stuff.albedo, stuff.emission, stuff.scattering_albedo, stuff.medium_source)
+    return any(isinstance(light, Sky) for light in scene.lights) or any(bool(jnp.any(f > 0)) for f in fields if f is not None)
 
 
 def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint) -> None:

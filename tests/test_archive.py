@@ -163,6 +163,7 @@ def test_checkpoints_of_another_solve(tmp_path):
         rm.Checkpoint(path, every=-1)
 
 
+@pytest.mark.slow
 def test_on_the_command_line(tmp_path, monkeypatch):
     from click.testing import CliRunner
 

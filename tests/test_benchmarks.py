@@ -24,6 +24,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=900)
 
 
+@pytest.mark.slow
 def test_accuracy(tmp_path):
     # A problem whose answer is exact at any size; the record says what was run, on what, and how it went.
     record = tmp_path / "record.json"

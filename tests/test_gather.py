@@ -315,3 +315,15 @@ def test_silhouettes_show_no_voxels():
 def test_light_field_is_made_once():
     solution = stand_in(rm.Scene(LATTICE, boundary=closed()))
     assert light_field(solution) is light_field(solution)
+
+
+def test_sun_on_a_ball_that_stands_out_of_the_roof():
+    """Outside the lattice there is no fog on the way to the sun: transmittance 1, not NaN."""
+    scene = rm.Scene(
+        LATTICE, [rm.Solid(rm.Sphere((0.5, 0.5, 1.0), 0.2))], rm.Medium(3.0, 0.1), [rm.Sun((0, 0, -1))],
+        rm.Boundary(rm.Wall(), rm.Wall(), (rm.Wall(), rm.OPEN)),
+    )  # fmt: skip
+    above, below = jnp.array([[0.5, 0.5, 1.21]]), jnp.array([[0.5, 0.1, 0.5]])
+    up = jnp.array([[0.0, 0.0, 1.0]])
+    assert_close(gather._sunlit(scene, above, up, up), [[1]], rtol=1e-6)
+    assert_close(gather._sunlit(scene, below, up, up), [[np.exp(-3.1 * 0.5)]], rtol=1e-5)

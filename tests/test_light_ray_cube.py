@@ -174,6 +174,7 @@ def test_evolution_is_every_ray_followed_by_hand(shape, boundary, medium, attenu
     np.testing.assert_allclose(arrived.voxels[0], fluence, atol=5e-6)
 
 
+@pytest.mark.slow
 def test_turned_scene_has_the_turned_light():
     # The six faces are alike. Equal walls, because a node as near to two of them belongs to the first, and a smooth sky.
     # Float32 rounding only.

@@ -57,7 +57,7 @@ def test_fluence_in_fog(n):
     assert_close(fluence, 4 * np.pi * column(rows, "mean_radiance"), rms=0.005, bias=0.003, worst=0.015)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "ring" else n for n in SCENES])
 def test_energy_is_balanced(name):
     assert abs(float(solved(name, 32).energy.imbalance)) < 0.01
 

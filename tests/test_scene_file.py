@@ -248,6 +248,7 @@ def test_a_sky_image_is_seen_the_right_way_round(tmp_path):
 # On the command line
 
 
+@pytest.mark.slow
 def test_init_and_render(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(cli, "_use_cache", lambda: None)
