@@ -26,7 +26,10 @@ Where the scheme loses or makes light, by how much (M = 5 unless said; `tests/te
   three balls in fog (N = 64, iterated to the end) then have irradiances 41 % low and lose 23 % of their power; with light that
   goes on to the solid, 3 % low, and 5 % too much power.
 - Edges. Nodes along a concave edge have slanting normals, and rays that arrive there from behind the wall arrive dark: a closed
-  room of 32 voxels with albedo 0.5 loses 8 % of its power, in proportion to M / N.
+  room of 32 voxels with albedo 0.5 loses 8 % of its power, and more the larger M / N is.
+
+Together, three balls in fog (figure 5; N = 128, linear) iterated to the end against a path tracer: irradiance 3.0 % low (rms
+3.9 %), fluence 3.6 % low (rms 4.4 %). The paper's 5 iterations leave 51 % of the irradiance out: albedos of 0.9 need more.
 
 Public: `LightRayCube`, `NodeFields`, `coordinate_evolution`, `local_transformation`, `count_laps`.
 """
