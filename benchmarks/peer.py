@@ -31,7 +31,9 @@ class Comparison:
 
     def table(self) -> str:
         """What the goal takes; "first" times include compilation."""
-        rows = [("scene", "quantity", "goal %", "ours s", "first s", "setting", "rms %", "Mitsuba s", "first pass s", "ratio")]
+        rows: list[tuple[str, ...]] = [
+            ("scene", "quantity", "goal %", "ours s", "first s", "setting", "rms %", "Mitsuba s", "first pass s", "ratio")
+        ]
         for line in self.summary:
             ours = line["ours"]
             cells = ["not reached", "", "", "", ""]

@@ -12,7 +12,7 @@ _ERRORS = ("bias %", "rms %", "worst %", "reference %", "target", "met")
 
 def accuracy_table(records: Iterable[dict[str, Any]]) -> str:
     """One line for each quantity of each problem; errors in per cent of what the problem relates them to."""
-    rows = [(*_HEAD, *_ERRORS)]
+    rows: list[tuple[str, ...]] = [(*_HEAD, *_ERRORS)]
     for record in records:
         size, directions = str(record["size"]), str(record["directions"])
         if "error" in record:

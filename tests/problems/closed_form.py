@@ -180,7 +180,7 @@ def turned_field(field: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """A field (nx, ny, nz) of the lattice, turned by a signed permutation matrix."""
     axes = np.argmax(np.abs(turn), axis=1)
     reversed_axes = [new for new, old in enumerate(axes) if turn[new, old] < 0]
-    return np.flip(field.transpose(axes), reversed_axes)
+    return np.flip(field.transpose(axes), tuple(reversed_axes))
 
 
 def _octants(shape: tuple[int, int, int], turn: np.ndarray) -> rm.Medium:
