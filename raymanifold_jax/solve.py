@@ -78,7 +78,8 @@ def solve(
             system, quadrature = nodes.system, nodes.quadrature
         else:
             layout = make_layout(scene, surfaces)
-            transport = make_transport(layout, quadrature, stuff.extinction, scene.bands, area=surfaces.area if _exchanges(scene, stuff) else None)
+            area = surfaces.area if _exchanges(scene, stuff) else None
+            transport = make_transport(layout, quadrature, stuff.extinction, scene.bands, area=area)
             system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff))
         iteration = Iteration(system, certify(system), float(rtol), max_sweeps, meter)
         if checkpoint is not None:

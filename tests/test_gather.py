@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import raymanifold_jax as rm
+from raymanifold_jax import gather
 from raymanifold_jax.gather import light_field
 from raymanifold_jax.interpolation import element_table, interpolate_irradiance, slopes
 from raymanifold_jax.solution import Energy, Solution, _Hidden

@@ -196,7 +196,8 @@ def test_axes_of_unequal_length_may_be_exchanged(x64):
 
 
 @pytest.mark.parametrize(
-    ("side", "width"), [pytest.param(rm.PERIODIC, 4, marks=pytest.mark.slow), (rm.PERIODIC, 1), pytest.param(rm.MIRROR, 1, marks=pytest.mark.slow)]
+    ("side", "width"),
+    [(rm.PERIODIC, 1), *(pytest.param(side, n, marks=pytest.mark.slow) for side, n in ((rm.PERIODIC, 4), (rm.MIRROR, 1)))],
 )
 @pytest.mark.parametrize("row", [r for r in problems.table("closed_enclosures.csv") if "plates" in r["case"]])
 def test_infinite_grey_plates(row, side, width):
