@@ -76,16 +76,12 @@ def finite(name: str, value: Any, shape: tuple[int, ...] | None = None) -> Numbe
 
 def non_negative(name: str, value: Any, shape: tuple[int, ...] | None = None) -> Numbers:
     """`value`, finite and >= 0."""
-    return _check(
-        name, value, shape, lambda v: np.isfinite(v) & (v >= 0), "finite numbers >= 0", "use 0 to switch it off"
-    )
+    return _check(name, value, shape, lambda v: np.isfinite(v) & (v >= 0), "finite numbers >= 0", "use 0 to switch it off")
 
 
 def positive(name: str, value: Any, shape: tuple[int, ...] | None = None) -> Numbers:
     """`value`, finite and > 0."""
-    return _check(
-        name, value, shape, lambda v: np.isfinite(v) & (v > 0), "finite numbers > 0", "check its sign and its unit"
-    )
+    return _check(name, value, shape, lambda v: np.isfinite(v) & (v > 0), "finite numbers > 0", "check its sign and its unit")
 
 
 def in_unit_interval(name: str, value: Any, shape: tuple[int, ...] | None = None) -> Numbers:
@@ -155,11 +151,7 @@ def instance(name: str, value: Any, types: type | tuple[type, ...], advice: str)
     """Raise `TypeError` unless `value` is an instance of one of `types`."""
     types = types if isinstance(types, tuple) else (types,)
     if not isinstance(value, types):
-        got = (
-            f"the class {value.__name__} itself"
-            if isinstance(value, type)
-            else f"{_show(value)} ({type(value).__name__})"
-        )
+        got = f"the class {value.__name__} itself" if isinstance(value, type) else f"{_show(value)} ({type(value).__name__})"
         fail(name, got, " or ".join(t.__name__ for t in types), advice, TypeError)
 
 

@@ -63,9 +63,7 @@ def element_table(scene: Scene, surfaces: Surfaces) -> ElementTable:
     if not len(surfaces):
         position = np.zeros((1, 3))
     normal = surfaces.normal if len(surfaces) else np.zeros((1, 3))
-    return ElementTable(
-        jnp.asarray(row.ravel()), jnp.asarray(members), jnp.asarray(position, real), jnp.asarray(normal, real)
-    )
+    return ElementTable(jnp.asarray(row.ravel()), jnp.asarray(members), jnp.asarray(position, real), jnp.asarray(normal, real))
 
 
 def slopes(scene: Scene, table: ElementTable, values: Float[Array, "E C"]) -> Float[Array, "E C 3"]:

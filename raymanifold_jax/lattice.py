@@ -42,9 +42,7 @@ class Lattice(eqx.Module):
         self.shape = (nx, ny, nz)
         for name, value in (("spacing", spacing), ("origin", origin)):
             if checks.is_traced(value):
-                checks.fail(
-                    name, value, "known numbers", "a lattice is static: make it outside jit and grad", TypeError
-                )
+                checks.fail(name, value, "known numbers", "a lattice is static: make it outside jit and grad", TypeError)
         self.spacing = float(checks.positive("spacing", spacing, ()))
         x, y, z = (float(c) for c in checks.vector3("origin", origin))
         self.origin = (x, y, z)
@@ -88,7 +86,5 @@ class Lattice(eqx.Module):
             return (points - jnp.asarray(self.lower, points.dtype)) / self.spacing
         numbers = checks.array("points", points)
         if numbers.ndim == 0 or numbers.shape[-1] != 3:
-            checks.fail(
-                "points", f"an array of shape {numbers.shape}", "shape (..., 3)", "put x, y and z on the last axis"
-            )
+            checks.fail("points", f"an array of shape {numbers.shape}", "shape (..., 3)", "put x, y and z on the last axis")
         return (numbers - self.lower) / self.spacing

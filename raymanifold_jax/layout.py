@@ -278,9 +278,7 @@ def make_ordinates(quadrature: Quadrature, bands: int, plane_size: int) -> tuple
     w = quadrature.directions
     dominant = np.argmax(np.abs(w), axis=1)
     groups = {
-        (axis, sign): np.nonzero((dominant == axis) & (np.sign(w[:, axis]) == sign))[0]
-        for axis in range(3)
-        for sign in (1, -1)
+        (axis, sign): np.nonzero((dominant == axis) & (np.sign(w[:, axis]) == sign))[0] for axis in range(3) for sign in (1, -1)
     }
     largest = max(len(g) for g in groups.values())
     wanted = min(2 * _WORD, max(8, _CHUNK // (bands * plane_size)))

@@ -345,8 +345,7 @@ class Scene(eqx.Module):
             parts.append(_count(self.bands, "band"))
         sides = ["wall" if isinstance(side, Wall) else side.name.lower() for side in self.boundary.sides]
         axes = (
-            f"{axis} {a}" if a == b else f"{axis} {a}/{b}"
-            for axis, a, b in zip("xyz", sides[::2], sides[1::2], strict=True)
+            f"{axis} {a}" if a == b else f"{axis} {a}/{b}" for axis, a, b in zip("xyz", sides[::2], sides[1::2], strict=True)
         )
         return ", ".join(parts) + "; sides " + ", ".join(axes)
 
@@ -370,9 +369,7 @@ def _leaf(value: checks.Numbers) -> jax.Array:
 
 def _banded(name: str, value: checks.Numbers) -> jax.Array:
     if value.ndim > 1 or value.shape == (0,):
-        checks.fail(
-            name, f"an array of shape {value.shape}", "a number or shape (bands,)", "pass one value for each band"
-        )
+        checks.fail(name, f"an array of shape {value.shape}", "a number or shape (bands,)", "pass one value for each band")
     return _leaf(value)
 
 
@@ -380,9 +377,7 @@ def _voxel_field(name: str, value: Any) -> jax.Array:
     numbers = checks.non_negative(name, value)
     if numbers.ndim not in (0, 1, 3, 4) or 0 in numbers.shape:
         expected = "a number or shape (bands,), (nx, ny, nz) or (nx, ny, nz, bands)"
-        checks.fail(
-            name, f"an array of shape {numbers.shape}", expected, "give three voxel axes, of length 1 voxel if thin"
-        )
+        checks.fail(name, f"an array of shape {numbers.shape}", expected, "give three voxel axes, of length 1 voxel if thin")
     return _leaf(numbers)
 
 
@@ -442,9 +437,7 @@ def _axis(name: str, value: Any) -> Any:
     pair = isinstance(value, list | tuple)
     sides = tuple(value) if pair else (value, value)
     if len(sides) != 2:
-        checks.fail(
-            name, f"{len(sides)} sides", "one side for both, or a pair (lower, upper)", f"{name}=(OPEN, Wall())"
-        )
+        checks.fail(name, f"{len(sides)} sides", "one side for both, or a pair (lower, upper)", f"{name}=(OPEN, Wall())")
     for side in sides:
         checks.instance(name, side, (Side, Wall), f"pass OPEN, MIRROR, PERIODIC or Wall(albedo=...), as in {name}=OPEN")
     if (sides[0] is PERIODIC) != (sides[1] is PERIODIC):
@@ -455,9 +448,7 @@ def _axis(name: str, value: Any) -> Any:
 def _parts(name: str, parts: Any, kinds: tuple[type, ...]) -> tuple[Any, ...]:
     if not isinstance(parts, list | tuple):
         advice = f"put it in a list: {name}=[...]"
-        checks.fail(
-            name, f"a {type(parts).__name__}", f"a list of {' or '.join(k.__name__ for k in kinds)}", advice, TypeError
-        )
+        checks.fail(name, f"a {type(parts).__name__}", f"a list of {' or '.join(k.__name__ for k in kinds)}", advice, TypeError)
     for i, part in enumerate(parts):
         advice = f"put {' or '.join(k.__name__ + '(...)' for k in kinds)} in {name}"
         if isinstance(part, Shape) and Solid in kinds:

@@ -8,9 +8,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 
-def shift(
-    values: Float[Array, "D C P"], offsets: Int[Array, " D"], width: int, wrap_v: bool
-) -> Float[Array, "D C P"]:
+def shift(values: Float[Array, "D C P"], offsets: Int[Array, " D"], width: int, wrap_v: bool) -> Float[Array, "D C P"]:
     """Move the rays of each direction by a flat offset: 0, +-1 (along v) or +-`width` (along u).
 
     Planes are flat with `width` voxels along v. Both ends are joined, so u is periodic as it stands; ghost voxels at the rim

@@ -96,20 +96,14 @@ def read_exr(
             "write or copy it again"
         ) from error
     if parts != 1:
-        checks.fail(
-            "path", f"{str(path)!r} with {parts} parts", "a single part", "split it with exrmultipart -separate"
-        )
+        checks.fail("path", f"{str(path)!r} with {parts} parts", "a single part", "split it with exrmultipart -separate")
     shapes = {plane.shape for plane in planes.values()}
     if len(shapes) != 1:
-        checks.fail(
-            "path", f"{str(path)!r} with channels of shapes {shapes}", "one shape", "resample the channels first"
-        )
+        checks.fail("path", f"{str(path)!r} with channels of shapes {shapes}", "one shape", "resample the channels first")
     names = [name for name in "RGBA" if name in planes]
     names += [name for name in planes if name not in names]
     image = np.stack([np.asarray(planes[name], dtype=np.float32) for name in names], axis=-1)
-    kept = {
-        key: value for key, value in header.items() if key not in _RESERVED and isinstance(value, str | float | int)
-    }
+    kept = {key: value for key, value in header.items() if key not in _RESERVED and isinstance(value, str | float | int)}
     return image, names, kept
 
 
@@ -134,9 +128,7 @@ def written_atomically(path: str | os.PathLike[str]) -> Iterator[Path]:
         got, advice = f"{os.fspath(path)!r} in {str(target.parent)!r}", "make the directory, or write elsewhere"
         checks.fail("path", got, "a file in a directory that exists", advice, FileNotFoundError)
     if target.exists() and not target.is_file():
-        checks.fail(
-            "path", repr(os.fspath(path)), "the name of a regular file", "it is something else: add a file name"
-        )
+        checks.fail("path", repr(os.fspath(path)), "the name of a regular file", "it is something else: add a file name")
     temporary = target.with_name(f".{target.stem}-{secrets.token_hex(4)}{target.suffix}")
     try:
         yield temporary
