@@ -65,7 +65,7 @@ def main() -> None:
 @_sizes("Voxels along the longest side; may be repeated. [default: the size each problem's target is meant for]")
 @click.option("--all-sizes", is_flag=True, help="All of each problem's own sizes.")
 @click.option("--directions", type=_at_least(9), metavar="N", help="[default: 200; with --quick 60]")
-@click.option("--quadrature", default="fibonacci", show_default=True, metavar="NAME", help="The kind of set.")
+@click.option("--quadrature", default="default", show_default=True, metavar="NAME", help="The kind of set.")
 @_repeats
 @_json
 def accuracy(
@@ -200,10 +200,10 @@ def peer(
 
 
 def _check_quadrature(name: str) -> None:
-    from .measure import QUADRATURES
+    from .measure import DEFAULT, QUADRATURES
 
-    if name not in QUADRATURES:
-        raise click.UsageError(f"--quadrature: got {name!r}, expected one of {', '.join(QUADRATURES)}")
+    if name not in (DEFAULT, *QUADRATURES):
+        raise click.UsageError(f"--quadrature: got {name!r}, expected {DEFAULT} or one of {', '.join(QUADRATURES)}")
 
 
 def _tell(text: str) -> None:

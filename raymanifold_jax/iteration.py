@@ -54,7 +54,7 @@ class System(eqx.Module):
 
     def bounce(self, leaving: Light) -> tuple[Light, Light]:
         """The light that arrives, of what leaves; and what of it leaves again."""
-        arriving = self.transport(leaving, fluence=self.scatters)
+        arriving = self.transport(leaving, fluence=self.scatters, scattered=True)
         return arriving, _reflected(self.materials, arriving)
 
     def nothing(self) -> Light:

@@ -5,7 +5,7 @@ With extinction s, scattering z, emission e and fluence phi, a segment of length
     L' = L exp(-s l) + (z phi / 4 pi + e) l (1 - exp(-s l)) / (s l)                    (s = 0 is allowed)
 
 Where a coefficient differs between voxels a segment ends at every voxel's faces, and each voxel's own values hold;
-else segments are equal and at most a voxel's side long. The fluence is that at a segment's middle, interpolated.
+else segments are equal and at most a voxel's side long. The fluence is interpolated, at the centre of what a segment sends.
 
 Public: `transmittance`, `march`, `fill`, `interpolate`; for blocks of rays `transmittance_between`, `march_between`.
 """
@@ -79,23 +79,35 @@ def _three(values: Array, axis: int) -> Array:
 
 
 def interpolate(scene: Scene, filled: Float[Array, "C nx ny nz"], u: Float[Array, "n 3"]) -> Float[Array, "n C"]:
-    """Trilinear interpolation of a field without gaps, at unfolded voxel coordinates; level within half a voxel of a side."""
-    return _interpolate(unfolded_axes(scene), filled.reshape(filled.shape[0], -1), tuple(u.T)).T
+    """Trilinear interpolation of a field without gaps, at unfolded voxel coordinates; straight on to the sides."""
+    return _interpolate(unfolded_axes(scene), _rimmed(filled), tuple(u.T)).T
 
 
-def _interpolate(axes: tuple[Axis, ...], flat: Array, u: tuple[Array, ...]) -> Array:
+def _rimmed(field: Float[Array, "C nx ny nz"]) -> Float[Array, "C V"]:
+    """A field with a layer of voxels around it that goes on in a straight line, though not past 0 or twice as much; flat."""
+    for axis in (1, 2, 3):
+        n = field.shape[axis]
+        at = lambda i, field=field, axis=axis: lax.slice_in_dim(field, i, i + 1, axis=axis)
+        beyond = lambda i, j, at=at: jnp.clip(2 * at(i) - at(j), 0.0, 2 * jnp.maximum(at(i), 0.0))
+        inner = min(1, n - 1)
+        field = jnp.concatenate([beyond(0, inner), field, beyond(n - 1, n - 1 - inner)], axis)
+    return field.reshape(field.shape[0], -1)
+
+
+def _interpolate(axes: tuple[Axis, ...], rimmed: Array, u: tuple[Array, ...]) -> Array:
+    """`rimmed` is what `_rimmed` makes of a field."""
     corners = []
     for axis, x in zip(axes, u, strict=True):
         floor = jnp.floor(x - 0.5)
         after = x - 0.5 - floor
         index = floor.astype(jnp.int32)
-        corners.append(((1 - after, axis.fold_index(index)), (after, axis.fold_index(index + 1))))
-    ny, nz = axes[1].count, axes[2].count
-    total = jnp.zeros((flat.shape[0], *u[0].shape), flat.dtype)
+        corners.append(((1 - after, axis.fold_index(index, 1) + 1), (after, axis.fold_index(index + 1, 1) + 1)))
+    ny, nz = axes[1].count + 2, axes[2].count + 2
+    total = jnp.zeros((rimmed.shape[0], *u[0].shape), rimmed.dtype)
     for a, i in corners[0]:
         for b, j in corners[1]:
             for c, k in corners[2]:
-                total = total + (a * b * c) * flat.at[:, (i * ny + j) * nz + k].get(mode="promise_in_bounds")
+                total = total + (a * b * c) * rimmed.at[:, (i * ny + j) * nz + k].get(mode="promise_in_bounds")
     return total
 
 
@@ -110,6 +122,13 @@ def _share(depth: Array) -> Array:
     small = depth < 1e-3
     safe = jnp.where(small, 1.0, depth)
     return jnp.where(small, 1 - depth / 2 + depth**2 / 6, -jnp.expm1(-safe) / safe)
+
+
+def _center(depth: Array) -> Array:
+    """Where in a segment of this optical depth, as a share of it, lies the centre of what reaches its near end."""
+    small = depth < 0.1
+    safe = jnp.where(small, 1.0, depth)
+    return jnp.where(small, 0.5 - depth / 12, 1 / safe - 1 / jnp.expm1(jnp.minimum(safe, 80.0)))
 
 
 def _transmittance(scene: Scene, start: Array, end: Array) -> Array:
@@ -131,19 +150,21 @@ def transmittance_between(scene: Scene, o: Array, w: Array, start: Array, stop: 
     if extinction.shape[1] == 1:
         depth = extinction * ((stop - start) * spacing)
     else:
-        add = lambda depth, middle, voxel, length: depth + _at(extinction, voxel) * (length * spacing)
+        add = lambda depth, point, voxel, length: depth + _at(extinction, voxel) * (length * spacing)
         depth = _walk(unfolded_axes(scene), o, w, start, stop, add, jnp.zeros((len(extinction), len(o)), o.dtype))
     return jnp.broadcast_to(jnp.exp(-depth), (scene.bands, len(o))).T
 
 
-def march_between(context: tuple[Scene, Array], origins: Array, directions: Array, start: Array, stop: Array):
-    """`march` for one block, from fluence without gaps."""
+def march_between(
+    context: tuple[Scene, Array | None], origins: Array, directions: Array, start: Array, stop: Array
+) -> tuple[Float[Array, "n C"], Float[Array, "n C"]]:
+    """`march` for one block, from fluence without gaps; None: nothing is scattered."""
     scene, filled = context
     shape = (scene.bands, len(origins))
     if scene.medium is None:
         return jnp.zeros(shape, origins.dtype).T, jnp.ones(shape, origins.dtype).T
     axes, spacing = unfolded_axes(scene), scene.lattice.spacing
-    flat = filled.reshape(filled.shape[0], -1).astype(origins.dtype)
+    rimmed = None if filled is None else _rimmed(filled).astype(origins.dtype)
     # From the near end on, so that a far eye costs no precision.
     start, stop = (jnp.where(jnp.isfinite(t), t, 0.0) for t in (start, stop))
     w = sloped(directions)
@@ -152,11 +173,13 @@ def march_between(context: tuple[Scene, Array], origins: Array, directions: Arra
     coefficients = _coefficients(scene)
     uniform = all(c.shape[1] == 1 for c in coefficients)
 
-    def add(state, middle, voxel, step):
+    def add(state, point, voxel, step):
         radiance, depth = state
-        scattering, absorption, emission = (_at(c, voxel) for c in coefficients)
-        source = scattering / (4 * jnp.pi) * _interpolate(axes, flat, middle) + emission
+        scattering, absorption, source = (_at(c, voxel) for c in coefficients)
         own = (scattering + absorption) * (step * spacing)
+        if rimmed is not None:
+            seen = _interpolate(axes, rimmed, point(step * _center(own.mean(0))))
+            source = source + scattering / (4 * jnp.pi) * seen
         return radiance + jnp.exp(-depth) * source * (step * spacing) * _share(own), depth + own
 
     state = (jnp.zeros(shape, o.dtype), jnp.zeros(shape, o.dtype))
@@ -172,7 +195,7 @@ def _at(coefficient: Array, voxel: Array | None) -> Array:
 
 
 def _walk(axes: tuple[Axis, ...], o: Array, w: Array, start: Array, stop: Array, add: Callable, state: Any) -> Any:
-    """state = add(state, middle, voxel, length) for every voxel that rays cross between two distances."""
+    """state = add(state, point, voxel, length) for every voxel that rays cross between two distances; point(distance in it)."""
     (ny, nz), xs, ws = (axes[1].count, axes[2].count), tuple(o.T), tuple(w.T)
     index = tuple(jnp.floor(x + start * v).astype(jnp.int32) for x, v in zip(xs, ws, strict=True))
 
@@ -182,9 +205,9 @@ def _walk(axes: tuple[Axis, ...], o: Array, w: Array, start: Array, stop: Array,
         planes = [(i + (v > 0) - x) / v for i, x, v in zip(index, xs, ws, strict=True)]
         crossing = jnp.minimum(jnp.minimum(planes[0], planes[1]), planes[2])
         after = jnp.clip(crossing, t, jnp.maximum(stop, t))
-        middle = tuple(x + 0.5 * (t + after) * v for x, v in zip(xs, ws, strict=True))
+        point = lambda s: tuple(x + (t + s) * v for x, v in zip(xs, ws, strict=True))
         i, j, k = (axis.fold_index(n) for axis, n in zip(axes, index, strict=True))
-        state = add(state, middle, (i * ny + j) * nz + k, after - t)
+        state = add(state, point, (i * ny + j) * nz + k, after - t)
         going = after < stop
         index = tuple(
             n + jnp.where(going & (p <= crossing), jnp.where(v > 0, 1, -1), 0)
@@ -203,9 +226,8 @@ def _stride(axes: tuple[Axis, ...], o: Array, w: Array, start: Array, stop: Arra
 
     def step(carry):
         number, state = carry
-        t = start + (number + 0.5) * length
-        middle = tuple(x + t * v for x, v in zip(xs, ws, strict=True))
-        return number + 1, add(state, middle, None, jnp.where(number < count, length, 0.0))
+        point = lambda s: tuple(x + (start + number * length + s) * v for x, v in zip(xs, ws, strict=True))
+        return number + 1, add(state, point, None, jnp.where(number < count, length, 0.0))
 
     most = jnp.max(count, initial=0.0)
     return lax.while_loop(lambda carry: carry[0] < most, step, (jnp.zeros((), o.dtype), state))[1]

@@ -26,6 +26,7 @@ from .quadrature import Quadrature
 from .scene import Scene, Wall
 from .surfaces import Surfaces
 from .transport.characteristic import Inflow, SweptMedium, count_laps, mark_hits, sweep, thin_limit
+from .transport.slopes import THIN, source_slopes
 from .transport.transpose import transposed_sweep
 
 _MOST_LAPS = 1 << 16
@@ -110,13 +111,26 @@ class Transport(eqx.Module):
     voxel_sums: Float[Array, "C nx ny nz"]
     coverage: Float[Array, "nx ny nz"]  # weights of the paths through each voxel; 0 inside solids
     thin: bool = eqx.field(static=True)
+    onward: bool = eqx.field(static=True)  # see `SweptMedium`
     factors: Light | None = None  # what leaves is multiplied by, for the exchange of power to balance
+    # The medium's albedo times its factors, if light scattered in thick voxels has slopes.
+    albedo: Float[Array, "C nx ny nz"] | None = None
 
-    def __call__(self, leaving: Light, inflow: Inflow | None = None, fluence: bool = True) -> Light:
-        """Mean radiance arriving at elements and in voxels, of what leaves them and of what comes in through open sides."""
+    def __call__(self, leaving: Light, inflow: Inflow | None = None, fluence: bool = True, scattered: bool = False) -> Light:
+        """Mean radiance arriving at elements and in voxels, of what leaves them and of what comes in through open sides.
+
+        With `scattered` what leaves the voxels is scattered light, which in thick ones is linear; else it is even in each.
+        """
         leaving, inflow = _balanced(self.factors, leaving, inflow)
-        sums = _sweep(self.layout, self.ordinates, self.extinction, self.thin, leaving, inflow, fluence)
+        albedo = self.albedo if scattered else None
+        sums = _sweep(self.layout, self.ordinates, self._medium(), leaving, inflow, fluence, albedo)
         return _means(sums, Light(self.element_sums, self.voxel_sums))
+
+    def _medium(self) -> SweptMedium | None:
+        """The medium without light of its own."""
+        if self.extinction is None:
+            return None
+        return SweptMedium(self.extinction, jnp.zeros_like(self.extinction), self.thin, onward=self.onward)
 
 
 @eqx.filter_jit
@@ -153,7 +167,7 @@ def _balance(transport: Transport, area: Float[Array, " E"]) -> Transport:
         sums = Light(sums.elements, transport.voxel_sums)
     factors = Light(jnp.ones_like(power.elements))
     for _ in range(_ROUNDS):
-        sent = _transposed(layout, transport.ordinates, extinction, transport.thin, jax.tree.map(_ratio, power, sums))
+        sent = _transposed(layout, transport.ordinates, transport._medium(), jax.tree.map(_ratio, power, sums))
         factors = jax.tree.map(_factor, power, sent)
         swept = _furnace(transport, factors)
         sums = Light(swept.elements, None if power.voxels is None else swept.voxels)
@@ -166,8 +180,7 @@ def _factor(wanted: Array, sent: Array) -> Array:
 
 
 @eqx.filter_jit
-def _transposed(layout: Layout, ordinates, extinction, thin: bool, asked: Light) -> Light:
-    medium = None if extinction is None else SweptMedium(extinction, jnp.zeros_like(extinction), thin)
+def _transposed(layout: Layout, ordinates, medium: SweptMedium | None, asked: Light) -> Light:
     return Light(*transposed_sweep(layout, ordinates, asked.elements, asked.voxels, medium))
 
 
@@ -178,11 +191,11 @@ def _ratio(sums: Array, furnace: Array) -> Array:
 
 # A program of its own: furnaces, bounces and first flights of one shape share it.
 @eqx.filter_jit
-def _sweep(layout, ordinates, extinction, thin, leaving: Light, inflow: Inflow | None, fluence: bool) -> Light:
-    medium = None
-    if extinction is not None:
-        dark = jnp.zeros((extinction.shape[0], *layout.shape), extinction.dtype)
-        medium = SweptMedium(extinction, layout.to_padded(dark if leaving.voxels is None else leaving.voxels), thin)
+def _sweep(layout, ordinates, medium: SweptMedium | None, leaving: Light, inflow, fluence: bool, albedo=None) -> Light:
+    if medium is not None:
+        source = medium.source if leaving.voxels is None else layout.to_padded(leaving.voxels)
+        slopes = None if albedo is None else source_slopes(layout, source, layout.to_padded(albedo), medium.extinction)
+        medium = dataclasses.replace(medium, source=source, slopes=slopes)
     return Light(*sweep(layout, ordinates, leaving.elements, medium, inflow, fluence))
 
 
@@ -191,7 +204,7 @@ _mark_hits = eqx.filter_jit(mark_hits)
 
 def _furnace(transport: Transport, leaving: Light) -> Light:
     """The sums at elements and, outside solids, in voxels for light of 1, or in proportion to it."""
-    sums = _sweep(transport.layout, transport.ordinates, transport.extinction, transport.thin, leaving, None, True)
+    sums = _sweep(transport.layout, transport.ordinates, transport._medium(), leaving, None, True)
     assert sums.voxels is not None
     return Light(sums.elements, jnp.where(_solid(transport.layout), 0.0, sums.voxels))
 
@@ -205,21 +218,26 @@ def make_transport(
     quadrature: Quadrature,
     extinction: Float[Array, "C nx ny nz"] | None,
     bands: int,
-    mirrored: bool = True,
+    beam: bool = False,
     area: Float[np.ndarray, " E"] | None = None,
+    albedo: Float[Array, "C nx ny nz"] | None = None,
 ) -> Transport:
     """Prepare the sweeps of one set of directions over a layout.
 
-    With `mirrored`, directions on one side of the mirrors stand for their reflections too; without, they are swept as given.
+    With `area`, of the elements, the exchange of power is balanced. Where voxels are optically thick, light read next to a
+    surface is carried on to it and, with `albedo`, of the medium, scattered light is linear in each voxel. Directions on one
+    side of the mirrors stand for their reflections too; those of a `beam` do not, and its light is read as it is found:
+    carried on to a surface it would lose what it loses along it.
 
     **Raises** `ValueError` where rays along a periodic axis never end.
     """
-    if mirrored and layout.unfolding.axes:
+    if not beam and layout.unfolding.axes:
         quadrature = quadrature.mirrored(layout.unfolding.axes)
     largest_plane = int(np.prod(sorted(layout.padded)[1:]))
     ordinates = make_ordinates(quadrature, bands, largest_plane)
     padded = None if extinction is None else layout.to_padded(extinction)
     thin = extinction is not None and bool(jnp.max(extinction) * (np.sqrt(3) * layout.spacing) <= thin_limit(extinction.dtype))
+    thick = extinction is not None and bool(jnp.max(extinction) * layout.spacing > THIN)
     if 0 in layout.pad:
         ordinates, longest = eqx.filter_jit(count_laps)(layout, ordinates, padded, _MOST_LAPS)
         if int(longest) >= _MOST_LAPS:
@@ -228,9 +246,14 @@ def make_transport(
                 "a surface, an open side or an absorbing medium; close or open another side, or add absorption"
             )
     ones = lambda *shape: jnp.ones((bands, *shape), layout.plane.dtype)
-    transport = Transport(layout, _mark_hits(layout, ordinates), padded, ones(), ones(), ones(), thin)
+    transport = Transport(layout, _mark_hits(layout, ordinates), padded, ones(), ones(), ones(), thin, thick and not beam)
     sums = _furnace(transport, Light(ones(layout.elements), None if extinction is None else ones(*layout.shape)))
     assert sums.voxels is not None
     fields = {"element_sums": sums.elements, "voxel_sums": sums.voxels, "coverage": sums.voxels[0]}
     transport = dataclasses.replace(transport, **fields)
-    return transport if area is None else _balance(transport, jnp.asarray(area, layout.plane.dtype))
+    if area is not None:
+        transport = _balance(transport, jnp.asarray(area, layout.plane.dtype))
+    if thick and albedo is not None:
+        factor = 1.0 if transport.factors is None or transport.factors.voxels is None else transport.factors.voxels
+        transport = dataclasses.replace(transport, albedo=albedo * factor, thin=False)
+    return transport

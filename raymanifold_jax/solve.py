@@ -23,15 +23,13 @@ from .layout import make_layout
 from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
 from .progress import Progress, make_progress
-from .quadrature import Quadrature, fibonacci
+from .quadrature import Quadrature, for_scene
 from .scene import OPEN, PointLight, Scene, Sky, Sun
 from .solution import Energy, Solution, _Hidden
 from .surfaces import Surfaces, find_surfaces
 from .transport.characteristic import Characteristic
 from .transport.light_ray_cube import LightRayCube
 from .transport.ray_cube_system import CubeSystem, make_cube_system
-
-_DEFAULT_DIRECTIONS = 200
 
 
 def solve(
@@ -50,8 +48,8 @@ def solve(
 
     **Arguments:**
 
-    - `quadrature`: directions of the sweeps; `rm.quadrature.fibonacci(200)` if None. More directions reduce ray effects; time
-      grows with their number.
+    - `quadrature`: directions of the sweeps; `rm.quadrature.for_scene(scene)` if None, about 200. More directions reduce ray
+      effects; time grows with their number.
     - `scheme`: `rm.Characteristic()`, or the paper's `rm.LightRayCube(half_width=5)`, which brings its own directions:
       leave `quadrature` out.
     - `rtol`: the certified error bound's target, relative to the largest radiosity or medium source (times pi).
@@ -66,7 +64,7 @@ def solve(
     """
     _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint)
     cube = scheme if isinstance(scheme, LightRayCube) else None
-    quadrature = fibonacci(_DEFAULT_DIRECTIONS) if quadrature is None else quadrature
+    quadrature = for_scene(scene) if quadrature is None else quadrature
     check_memory(scene.lattice.shape, scene.bands, len(quadrature), scene.medium is not None)
     meter = make_progress(progress)
     with meter:
@@ -79,7 +77,9 @@ def solve(
         else:
             layout = make_layout(scene, surfaces)
             area = surfaces.area if _exchanges(scene, stuff) else None
-            transport = make_transport(layout, quadrature, stuff.extinction, scene.bands, area=area)
+            transport = make_transport(
+                layout, quadrature, stuff.extinction, scene.bands, area=area, albedo=stuff.scattering_albedo
+            )
             system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff))
         iteration = Iteration(system, certify(system), float(rtol), max_sweeps, meter)
         if checkpoint is not None:

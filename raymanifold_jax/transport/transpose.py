@@ -10,12 +10,15 @@ Public: `transposed_sweep`.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..layout import AxisReads, Layout, Ordinates
+from ..layout import AXES, AxisReads, Layout, Ordinates
 from .characteristic import (
     SweptMedium,
     _chunk,
@@ -38,10 +41,12 @@ def transposed_sweep(
     at_elements: Float[Array, "C E"],
     in_voxels: Float[Array, "C nx ny nz"] | None,
     medium: SweptMedium | None = None,
+    slopes_of: Callable[[Array], tuple[Array, ...]] | None = None,
 ) -> tuple[Float[Array, "C E"], Float[Array, "C nx ny nz"] | None]:
     """The transpose of `sweep` in (exitance, medium.source), applied to weights of its two results.
 
-    <sweep(x), y> = <x, transposed_sweep(y)> to rounding. The source of `medium` is not looked at.
+    <sweep(x), y> = <x, transposed_sweep(y)> to rounding. The source of `medium` and its slopes are not looked at;
+    `slopes_of`, linear, makes them of the padded source where there are any.
     """
     bands = at_elements.shape[0]
     dark = jnp.zeros((bands, *layout.padded), at_elements.dtype)
@@ -53,10 +58,12 @@ def transposed_sweep(
         wanted = None if asked is None else _on_axis(axis, lambda a, field=asked: _planes(field, a))
         rows = tuple(at_elements[:, r.element] for r in reads)
         sent = _axis_transpose(track, own, reads, rows, wanted)
-        back = [_on_axis(axis, lambda a, field=field: _from_planes(layout, a, field)) for field in sent if field is not None]
+        back = _on_axis(axis, lambda a: [_from_planes(layout, a, field) for field in _in_scene_order(sent, a)])
         return [total + field for total, field in zip(sums, back, strict=True)]
 
-    sums = [dark] if medium is None else [dark, dark]
+    if medium is not None:
+        medium = dataclasses.replace(medium, source=dark, slopes=None if slopes_of is None else (dark,) * 3)
+    sums = [dark] if medium is None else [dark] * (2 if slopes_of is None else 5)
     if layout.cubic:
         directions = jax.tree.map(lambda *a: jnp.stack(a), *ordinates)
         reads = jax.tree.map(lambda *a: jnp.stack(a), *layout.reads)
@@ -66,14 +73,23 @@ def transposed_sweep(
             sums = one_axis(axis, ordinates[axis], layout.reads[axis], sums)
     exitance = jnp.zeros((bands, layout.elements), at_elements.dtype)
     exitance = exitance.at[:, layout.source_element].add(sums[0].reshape(bands, -1)[:, layout.cell] * layout.share)
-    return exitance, None if medium is None else layout.from_padded(sums[1])
+    if medium is None:
+        return exitance, None
+    if slopes_of is not None:
+        sums[1] = sums[1] + jax.vjp(slopes_of, dark)[1](tuple(sums[2:]))[0]
+    return exitance, layout.from_padded(sums[1])
+
+
+def _in_scene_order(sent: tuple[Array, ...], axis: int) -> list[Array]:
+    """Slopes along the sweep axis, u and v put in the order x, y, z."""
+    return [*sent[:2], *(sent[2 + AXES[axis].index(a)] for a in range(len(sent) - 2))]
 
 
 def _axis_transpose(track: _Track, ordinates: Ordinates, reads: AxisReads, rows: tuple[Array, ...], wanted: Array | None):
-    """What was sent (exitance and, with a medium, source) in planes [K, C, P], of all chunks along one axis."""
+    """What was sent (exitance and, with a medium, source and its slopes) in planes [K, C, P], of all chunks along one axis."""
     fields = track.fields
     bands, real = fields.exitance.shape[1], fields.exitance.dtype
-    has_medium = fields.extinction is not None
+    kinds_sent = len(fields.sent)
     fluence = wanted is not None
     zero_row = jnp.zeros((bands, track.area), real)
 
@@ -94,14 +110,14 @@ def _axis_transpose(track: _Track, ordinates: Ordinates, reads: AxisReads, rows:
                 starts, rays, passing = track.cross(number, rays, chords, length, None, with_passing, sent)
                 return tuple(starts), rays, passing
 
-            return jax.vjp(step, nothing, (zero_row,) * (2 if has_medium else 1))[1]
+            return jax.vjp(step, nothing, (zero_row,) * kinds_sent)[1]
 
         def plane_step(k, carry):
             rays, totals = carry
             step = track.count - 1 - k
             number, chords = track.plane(own, step), _row(table, step)
             plane = _row(fields, number)
-            asked = ((nothing,) * 3, (zero_row,) * (2 if has_medium else 1))
+            asked = ((nothing,) * 3, (zero_row,) * kinds_sent)
             assert own.hit_bits is not None and own.probe_bits is not None
             kinds = ((_mean_of_hits, own.hit_bits), (_mean_of_paths, ~own.probe_bits))
             for (mean_of, bits), where, values in zip(kinds, reads, rows, strict=True):
@@ -140,4 +156,4 @@ def _axis_transpose(track: _Track, ordinates: Ordinates, reads: AxisReads, rows:
         return lax.fori_loop(0, own.laps - 1, lap, (rays, totals))[1]
 
     planes = jnp.zeros((track.count, bands, track.area), real)
-    return lax.fori_loop(0, ordinates.chunks, chunk_step, (planes, planes) if has_medium else (planes,))
+    return lax.fori_loop(0, ordinates.chunks, chunk_step, (planes,) * kinds_sent)
