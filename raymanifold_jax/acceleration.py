@@ -38,6 +38,7 @@ _FREE_PATH = 4.0  # times the distance to the nearest surface, where nothing els
 _ENOUGH = 0.05  # of the residual may be left: GMRES corrects the rest
 _MOST = 30  # steps of conjugate gradients
 _DAMPING = 0.8  # of Jacobi's smoothing
+_SMOOTHINGS = 2  # before and after a coarser level
 
 
 class _Level(NamedTuple):
@@ -45,6 +46,7 @@ class _Level(NamedTuple):
 
     links: tuple[Array, Array, Array]  # [C, nx, ny, nz] each
     loss: Array  # what a voxel absorbs, for J = 1
+    smoothing: Array  # the damping over the diagonal
 
     def apply(self, field: Array) -> Array:
         total = self.loss * field
@@ -53,9 +55,10 @@ class _Level(NamedTuple):
             total = total + flow - jnp.roll(flow, 1, axis)
         return total
 
-    @property
-    def diagonal(self) -> Array:
-        return sum((link + jnp.roll(link, 1, axis) for axis, link in enumerate(self.links, start=1)), start=self.loss)
+
+def _level(links: list[Array], loss: Array) -> _Level:
+    diagonal = sum((link + jnp.roll(link, 1, axis) for axis, link in enumerate(links, start=1)), start=loss)
+    return _Level((links[0], links[1], links[2]), loss, _DAMPING / diagonal)
 
 
 class Diffusion(eqx.Module):
@@ -123,17 +126,18 @@ def _conjugate_gradients(levels: tuple[_Level, ...], right: Array) -> Array:
 def _cycle(levels: tuple[_Level, ...], right: Array) -> Array:
     """One V-cycle: smoothing, the same on a lattice of half the size, smoothing. Symmetric."""
     level, coarser = levels[0], levels[1:]
-    smooth = _DAMPING / level.diagonal
-    field = smooth * right
+
+    def smoothed(field):
+        # In a loop, because XLA otherwise works a step out again for each of the points that the next step reads.
+        step = lambda _, field: field + level.smoothing * (right - level.apply(field))
+        return lax.fori_loop(0, _SMOOTHINGS, step, field)
+
+    field = smoothed(jnp.zeros_like(right))
     if not coarser:
-        for _ in range(3):
-            field = field + smooth * (right - level.apply(field))
-        return field
-    field = field + smooth * (right - level.apply(field))
-    field = field + _refine(_cycle(coarser, _coarsen(right - level.apply(field))), right.shape)
-    for _ in range(2):
-        field = field + smooth * (right - level.apply(field))
-    return field
+        return smoothed(field)
+    left = lax.optimization_barrier(right - level.apply(field))
+    field = field + _refine(_cycle(coarser, lax.optimization_barrier(_coarsen(left))), right.shape)
+    return smoothed(lax.optimization_barrier(field))
 
 
 def _pairs(field: Array, axis: int) -> Array:
@@ -145,15 +149,19 @@ def _pairs(field: Array, axis: int) -> Array:
 
 
 def _coarsen(field: Array) -> Array:
-    for axis in (1, 2, 3):
-        field = _pairs(field, axis)
-    return field
+    """Sums of eight neighbours."""
+    bands, *size = field.shape
+    field = jnp.pad(field, [(0, 0), *((0, n % 2) for n in size)])
+    halves = [m for n in size for m in (-(-n // 2), 2)]
+    return field.reshape(bands, *halves).sum((2, 4, 6))
 
 
 def _refine(field: Array, shape: tuple[int, ...]) -> Array:
-    for axis in (1, 2, 3):
-        field = lax.slice_in_dim(jnp.repeat(field, 2, axis), 0, shape[axis], axis=axis)
-    return field
+    """The transpose of `_coarsen`."""
+    bands, *size = field.shape
+    doubled = [m for n in size for m in (n, 2)]
+    spread = jnp.broadcast_to(field.reshape(bands, *(m for n in size for m in (n, 1))), (bands, *doubled))
+    return spread.reshape(bands, *(2 * n for n in size))[tuple(slice(n) for n in shape)]
 
 
 def _coarse_level(level: _Level) -> _Level:
@@ -166,7 +174,7 @@ def _coarse_level(level: _Level) -> _Level:
         for other in {1, 2, 3} - {axis}:
             link = _pairs(link, other)
         links.append(link / 2)  # twice as far
-    return _Level((links[0], links[1], links[2]), _coarsen(level.loss))
+    return _level(links, _coarsen(level.loss))
 
 
 def make_diffusion(transport: Transport, surfaces: Surfaces, stuff: Materials) -> Diffusion:
@@ -226,10 +234,8 @@ def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodi
     # Nothing happens in voxels inside solids; and a matrix that nearly is singular must not be.
     links_of = sum((link + jnp.roll(link, 1, axis) for axis, link in enumerate(links, start=1)), start=jnp.zeros_like(loss))
     loss = jnp.where(links_of + loss > 0, loss + 8 * jnp.finfo(real).eps * links_of, 1.0)
-    levels = [_Level((links[0], links[1], links[2]), loss)]
+    levels = [_level(links, loss)]
     while max(levels[-1].loss.shape[1:]) > 2:
         levels.append(_coarse_level(levels[-1]))
     voxels = None if stuff.scattering_albedo is None else power
-    return Diffusion(
-        tuple(levels), Light(of_elements, voxels), Light(stuff.albedo, stuff.scattering_albedo), probe, coupling
-    )
+    return Diffusion(tuple(levels), Light(of_elements, voxels), Light(stuff.albedo, stuff.scattering_albedo), probe, coupling)

@@ -8,6 +8,9 @@ and after one more step x' = b + K x the same with F - 1 for F, because (I - K)^
 row of K adds up to less than 1; better is a solution of (I - K) w = 1, which need not be exact. The last change is no such
 bound: at albedo 0.99 it can be 100 times smaller than the error.
 
+GMRES leaves residuals of either sign, large in few places, of which max |r| F makes far too much. One sweep more for any u says
+better: if |r| <= u - K u + t (w - K w), then |x* - x| <= u + t w; here u is what diffusion makes of |r|.
+
 Public: `System`, `Certificate`, `Iteration`, `certify`.
 """
 
@@ -35,6 +38,7 @@ _ENOUGH = 0.5  # w - K w of at least this ends the search for w
 _SEARCH = 24  # sweeps of it at most
 _STALLED = 24  # sweeps without a new smallest residual before giving up
 _GROWN = 1e3  # times the first residual: diverged
+_HOPED = 0.05  # what polishing is at first taken to make of a bound
 _ROUNDING = 2.0  # units in the last place by which a sweep's result may be off, of the largest radiance
 
 
@@ -74,12 +78,14 @@ class System(eqx.Module):
 class Certificate:
     """The error after a step is at most `factor` times the largest residual before it; `sweeps` were spent to know.
 
-    `factor` is inf, and `reason` says why, where no bound was found.
+    `factor` is inf, and `reason` says why, where no bound was found. `weights` and `slack`: w and w - K w.
     """
 
     factor: float
     sweeps: int
     reason: str = ""
+    weights: Light | None = None
+    slack: Light | None = None
 
 
 def certify(system: System) -> Certificate:
@@ -99,9 +105,15 @@ def certify(system: System) -> Certificate:
     from_rows = largest / (1 - largest) if largest < 1 else math.inf
     # From w - K w > 0 follows w > 0, but for rounding.
     factor = float(w.largest()) / least - 1 if least > 0.01 else math.inf
-    if math.isfinite(min(factor, from_rows)):
-        return Certificate(min(factor, from_rows), count)
-    return Certificate(math.inf, count, f"no w with w > K w was found in {count} sweeps: some light bounces without loss")
+    # What the float type cannot tell from light that bounces without loss.
+    lossless = 0.1 / (_ROUNDING * float(jnp.finfo(w.elements.dtype).eps))
+    if factor <= min(from_rows, lossless):
+        return Certificate(factor, count, "", w, jax.tree.map(jnp.subtract, ones, residual))
+    if from_rows <= lossless:
+        return Certificate(from_rows, count, "", ones, jax.tree.map(lambda one, a: one * (1 - a), ones, albedo))
+    return Certificate(
+        math.inf, count, f"as far as {w.elements.dtype} can tell in {count} sweeps, some light bounces without loss"
+    )
 
 
 @eqx.filter_jit
@@ -111,7 +123,7 @@ def _most_positive(light: Light):
 
 def _by_powers(system: System, total: Light) -> Certificate:
     """w = 1 + K 1 + K^2 1 + ..., until every path of light has had a chance to end; one sweep where albedos are moderate."""
-    total = jax.tree.map(lambda a: jnp.where(a > 0, 1.0, 0.0).astype(a.dtype), total)
+    ones = total = jax.tree.map(lambda a: jnp.where(a > 0, 1.0, 0.0).astype(a.dtype), total)
     power = system.bounce(total)[1]
     count = 1
     while float(power.largest()) > _CERTAIN and count < _POWERS:
@@ -120,7 +132,22 @@ def _by_powers(system: System, total: Light) -> Certificate:
     left = float(power.largest())
     if left >= 1 - 1e-6:
         return Certificate(math.inf, count, f"some light bounces {count} times without loss")
-    return Certificate(float(total.largest()) / (1 - left) - 1, count)
+    slack = jax.tree.map(jnp.subtract, ones, power)
+    return Certificate(float(total.largest()) / (1 - left) - 1, count, "", total, slack)
+
+
+@eqx.filter_jit
+def _bounded(weights: Light, slack: Light, residual: Light, u: Light, passed: Light):
+    """The largest of a u + t w - |r|, with t as the module's docstring says, and a as serves best; `passed` is K u."""
+    size = jax.tree.map(jnp.abs, residual)
+    missing = lambda r, covered, d: jnp.max(jnp.where(d > 0, (r - covered) / jnp.where(d > 0, d, 1.0), 0.0), initial=0.0)
+
+    def bound(a):
+        covered = jax.tree.map(lambda u, k: a * (u - k), u, passed)
+        t = jnp.stack(jax.tree.leaves(jax.tree.map(missing, size, covered, slack))).max()
+        return _most_positive(jax.tree.map(lambda r, u, w: a * u + t * w - r, size, u, weights))
+
+    return jnp.min(jax.lax.map(bound, jnp.linspace(0.0, 2.0, 21, dtype=residual.elements.dtype)))
 
 
 @eqx.filter_jit
@@ -145,6 +172,8 @@ class Iteration:
         self.checkpoint: Checkpoint | None = None
         self.stuck = False  # a solver's own word that it cannot go on
         self._more = 0  # sweeps that led to no iterate
+        self._tight = math.inf  # a bound on the present iterate's error, better than the factor's
+        self._gain = _HOPED  # of polishing, on the bound
 
     def _state(self) -> tuple:
         return self.arriving, self.residual, self.lost, np.array(self.residuals), np.array(self.target)
@@ -165,7 +194,38 @@ class Iteration:
 
     @property
     def bound(self) -> float:
-        return self.certificate.factor * self.residuals[-1] if self.residuals[-1] > 0 else 0.0
+        return min(self.certificate.factor * self.residuals[-1], self._tight) if self.residuals[-1] > 0 else 0.0
+
+    @property
+    def close(self) -> bool:
+        """Whether it is time to polish: not before, because that interrupts a solver."""
+        known = self.system.near is not None and self.certificate.weights is not None and self.sweeps_left >= 2
+        return known and not self.converged and self.bound * self._gain <= self.target
+
+    def polish(self) -> None:
+        """Two sweeps: one order of bounces more, which smooths the residual, and a closer look at what is left.
+
+        If the bound does not meet the target then, everything stays as it was, for the solver to go on.
+        """
+        weights, slack, begun = self.certificate.weights, self.certificate.slack, (self.arriving, self.residual)
+        assert weights is not None and slack is not None
+        before = self.bound
+        order, residual = self.system.bounce(self.residual)
+        self.reach(self.arriving + order, residual)
+        if self.over:
+            return
+        u = self.system.precondition(jax.tree.map(jnp.abs, residual))
+        tight = float(_bounded(weights, slack, residual, u, self.system.bounce(u)[1]))
+        self.spend(1)
+        self._tight = tight if math.isfinite(tight) else math.inf
+        self._meter.update(self.sweeps, math.pi * self.bound, math.pi * self.target)
+        if not self.converged:
+            # Not again before it can be expected to do.
+            self._gain = min(1.5 * self.bound / before, 0.5)
+            self.arriving, self.residual = begun
+            self._tight = math.inf
+            self.residuals.pop()
+            self.spend(1)
 
     @property
     def rounding(self) -> float:
@@ -173,6 +233,10 @@ class Iteration:
         eps = float(jnp.finfo(self.residual.elements.dtype).eps)
         largest = self.target / self._rtol
         return _ROUNDING * eps * (1 + self.certificate.factor) * largest if largest > 0 else 0.0
+
+    @property
+    def converged(self) -> bool:
+        return self.bound <= self.target
 
     @property
     def sweeps(self) -> int:
@@ -189,7 +253,7 @@ class Iteration:
     @property
     def ending(self) -> str:
         """How it stands: "" (go on), "converged", "no bound", "diverged", "stagnated" or "sweep limit"."""
-        if self.bound <= self.target:
+        if self.converged:
             return "converged"
         if not self.residuals[-1] <= _GROWN * self.residuals[0]:
             return "diverged"
@@ -209,6 +273,7 @@ class Iteration:
     def note(self, residual: float, largest: float) -> None:
         """One sweep more, and what it led to: the largest residual, and the largest of all that leaves."""
         self.residuals.append(residual)
+        self._tight = math.inf
         self.target = self._rtol * max(self._scale, largest)
         self._meter.update(self.sweeps, math.pi * self.bound, math.pi * self.target)
 

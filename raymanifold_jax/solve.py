@@ -160,7 +160,12 @@ def _check_steady(scene: Scene, surfaces: Surfaces, stuff: Materials) -> None:
 
 
 def _finish(
-    scene: Scene, surfaces: Surfaces, quadrature: Quadrature, stuff: Materials, iteration: Iteration, nodes: CubeSystem | None,
+    scene: Scene,
+    surfaces: Surfaces,
+    quadrature: Quadrature,
+    stuff: Materials,
+    iteration: Iteration,
+    nodes: CubeSystem | None,
     solver: object,
 ) -> Solution:
     system, bounced = iteration.system, iteration.arriving

@@ -67,6 +67,8 @@ class Krylov(eqx.Module):
             while not (iteration.over or space.exhausted):
                 space.step()
                 iteration.reach(begun + space.gain(), space.residual)
+                if iteration.close:
+                    iteration.polish()
             iteration.keep()
 
 
@@ -95,6 +97,8 @@ class Anderson(eqx.Module):
             after, new = mixed + order, combine([1, -1, 1], [left, sent, passed])
             changes = [*changes, (combine([1, -1], [after, arriving]), combine([1, -1], [new, residual]))][-self.history :]
             iteration.reach(after, new)
+            if iteration.close:
+                iteration.polish()
             iteration.keep()
 
 
