@@ -77,6 +77,7 @@ if TYPE_CHECKING:
     from raymanifold_jax.load import load as load
     from raymanifold_jax.mesh import Mesh as Mesh
     from raymanifold_jax.mesh import MeshReport as MeshReport
+    from raymanifold_jax.optimistix_solver import OptimistixFixedPoint as OptimistixFixedPoint
     from raymanifold_jax.render import render as render
     from raymanifold_jax.scene import MIRROR as MIRROR
     from raymanifold_jax.scene import OPEN as OPEN
@@ -97,7 +98,6 @@ if TYPE_CHECKING:
     from raymanifold_jax.shapes import Torus as Torus
     from raymanifold_jax.solution import Solution as Solution
     from raymanifold_jax.solve import solve as solve
-    from raymanifold_jax.optimistix_solver import OptimistixFixedPoint as OptimistixFixedPoint
     from raymanifold_jax.solvers import Anderson as Anderson
     from raymanifold_jax.solvers import Jacobi as Jacobi
     from raymanifold_jax.solvers import Krylov as Krylov

@@ -17,17 +17,17 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import checks
+from .acceleration import make_diffusion
 from .checkpoint import Checkpoint
 from .direct import first_flight, sky_radiance
-from .acceleration import make_diffusion
 from .iteration import Iteration, System, certify
 from .layout import make_layout
 from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
+from .optimistix_solver import OptimistixFixedPoint
 from .progress import Progress, make_progress
 from .quadrature import Quadrature, fibonacci
 from .scene import OPEN, PointLight, Scene, Sky, Sun
-from .optimistix_solver import OptimistixFixedPoint
 from .solution import Energy, Solution, _Hidden
 from .solvers import Anderson, Jacobi, Krylov, automatic
 from .surfaces import Surfaces, find_surfaces
