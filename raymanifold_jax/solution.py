@@ -158,8 +158,9 @@ class Solution(eqx.Module):
         """How the iteration ended."""
         bound, target, count = self.error_bound, self.target, self.sweeps
         if self.converged:
-            note = f"; rounding may add up to {self.rounding:.3g}: enable float64 if that matters" * (self.rounding > target)
-            return f"converged: error bound {bound:.3g} is within the target {target:.3g} after {count} sweeps ({self.solver}){note}"
+            text = f"converged: error bound {bound:.3g} is within the target {target:.3g} after {count} sweeps ({self.solver})"
+            rounding = f"; rounding may add up to {self.rounding:.3g}: enable float64 if that matters"
+            return text + rounding * (self.rounding > target)
         ending = {
             "no bound": f"no error bound: {self.no_bound}; lower an albedo below 1, or open a side",
             "stagnated": "stagnated at the float type's rounding; raise rtol, or enable float64",
