@@ -78,7 +78,8 @@ def convergence_table(rows: Iterable[dict[str, Any]]) -> str:
     rows = list(rows)
     lines = ["surface  scattering  depth  sweeps  seconds  ending      Jacobi  its seconds over these"]
     for r in rows:
-        text = f"{r['surface']:7g}  {r['scattering']:10g}  {r['depth']:5g}  {r['sweeps']:6d}  {r['seconds']:7.2f}  {r['ending']:10}"
+        text = f"{r['surface']:7g}  {r['scattering']:10g}  {r['depth']:5g}  "
+        text += f"{r['sweeps']:6d}  {r['seconds']:7.2f}  {r['ending']:10}"
         if "jacobi" in r:
             text += f"  {r['jacobi']:6.0f}  {r['jacobi seconds'] / r['seconds']:8.1f}"
         lines.append(text)
