@@ -12,6 +12,8 @@ import click
 _QUESTIONS = {
     "accuracy": "How far from known answers is the solver, and what does that cost?",
     "error-vs-time": "Which size, how many directions and which quadrature give the smallest error in a given time?",
+    "stability": "Does a solve stay finite, non-negative and within its bound where numbers are extreme?",
+    "convergence": "How many sweeps to a certified error of 1e-4, over albedos and optical depths?",
     "peer": "How long do we take for an error of 1 %, and how long does a path tracer on the same cores?",
 }
 
@@ -197,6 +199,47 @@ def peer(
         work_precision(result.ours, out, {"mitsuba": result.curves})
     _print_environment(about)
     click.echo(result.table())
+
+
+@main.command()
+@click.option("--quick", is_flag=True, help="The ends of each range only.")
+@_json
+def stability(quick: bool, json_file: Path | None) -> None:
+    """Extreme depths, albedos, contrasts, radiances, directions and shapes; float32 against float64."""
+    from .record import environment, write
+    from .stability import cases, measure, stability_table
+
+    rows = []
+    for case in cases(quick):
+        rows.append(measure(case, _tell))
+        write(json_file, _QUESTIONS["stability"], rows, environment=environment())
+    _print_environment(environment())
+    click.echo(stability_table(rows))
+    if any(row["verdict"] != "ok" for row in rows):
+        raise SystemExit(1)
+
+
+@main.command()
+@click.option("--quick", is_flag=True, help="The ends of each range only.")
+@click.option("--size", type=_at_least(2), default=32, show_default=True, help="Voxels along a side.")
+@click.option("--directions", type=_at_least(9), default=200, show_default=True)
+@click.option("--jacobi", type=_at_least(0), default=200, show_default=True, help="Its sweeps; the rest is extrapolated.")
+@click.option("--out", type=_NewFile(), metavar="FILE.png", help="Draw Jacobi's false convergence there (extra: plot).")
+@_json
+def convergence(quick: bool, size: int, directions: int, jacobi: int, out: Path | None, json_file: Path | None) -> None:
+    """Sweeps and time of the default solver and of Jacobi, in a foggy room; in float64."""
+    from .convergence import convergence_table, false_convergence, measure, rooms
+    from .record import environment, write
+
+    rows = []
+    for room in rooms(quick):
+        rows.append(measure(room, size, directions, jacobi, _tell))
+        write(json_file, _QUESTIONS["convergence"], rows, environment=environment())
+    if out is not None:
+        false_convergence(out)
+        click.echo(f"wrote {out}", err=True)
+    _print_environment(environment())
+    click.echo(convergence_table(rows))
 
 
 def _check_quadrature(name: str) -> None:

@@ -8,6 +8,7 @@ Public: `solve`.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import jax
@@ -16,16 +17,19 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import checks
+from .acceleration import make_diffusion
 from .checkpoint import Checkpoint
 from .direct import first_flight, sky_radiance
-from .iteration import Iteration, Jacobi, Krylov, System, certify
+from .iteration import Iteration, System, certify
 from .layout import make_layout
 from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
+from .optimistix_solver import OptimistixFixedPoint
 from .progress import Progress, make_progress
 from .quadrature import Quadrature, for_scene
 from .scene import OPEN, PointLight, Scene, Sky, Sun
 from .solution import Energy, Solution, _Hidden
+from .solvers import Anderson, Jacobi, Krylov, automatic
 from .surfaces import Surfaces, find_surfaces
 from .transport.characteristic import Characteristic
 from .transport.light_ray_cube import LightRayCube
@@ -37,7 +41,7 @@ def solve(
     quadrature: Quadrature | None = None,
     scheme: Characteristic | LightRayCube | None = None,
     rtol: float = 1e-4,
-    solver: Jacobi | Krylov | str = "auto",
+    solver: Jacobi | Krylov | Anderson | OptimistixFixedPoint | str = "auto",
     max_sweeps: int = 1000,
     throw: bool = False,
     progress: bool | Progress | None = None,
@@ -53,7 +57,9 @@ def solve(
     - `scheme`: `rm.Characteristic()`, or the paper's `rm.LightRayCube(half_width=5)`, which brings its own directions:
       leave `quadrature` out.
     - `rtol`: the certified error bound's target, relative to the largest radiosity or medium source (times pi).
-    - `solver`: `rm.Krylov()`, which is also what "auto" takes, or the paper's `rm.Jacobi()`, "auto" with its scheme.
+    - `solver`: `rm.Krylov()`, `rm.Anderson()`, `rm.OptimistixFixedPoint(...)` or the paper's `rm.Jacobi()`. "auto" takes
+      `Jacobi` with the paper's scheme and where little is reflected, else `Krylov`, with diffusion where light bounces often or
+      the medium is thick: see `Solution.solver`.
     - `max_sweeps`: the iteration stops there at the latest. With `Jacobi`, k of them are k of the paper's iterations: light
       straight from the sources, and k bounces. With `throw`, that raises `RuntimeError`; without, read
       `Solution.converged` and `Solution.result`.
@@ -71,6 +77,7 @@ def solve(
         meter.start(f"solve {scene.summary()}")
         surfaces = find_surfaces(scene)
         stuff = materials(scene, surfaces)
+        _check_steady(scene, surfaces, stuff)
         nodes = None if cube is None else make_cube_system(scene, surfaces, cube)
         if nodes is not None:
             system, quadrature = nodes.system, nodes.quadrature
@@ -81,15 +88,25 @@ def solve(
                 layout, quadrature, stuff.extinction, scene.bands, area=area, albedo=stuff.scattering_albedo
             )
             system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff))
+            system = dataclasses.replace(system, near=make_diffusion(transport, surfaces, stuff))
+        if isinstance(solver, str):
+            solver = automatic(system, _depth(scene, stuff)) if nodes is None else Jacobi()
         iteration = Iteration(system, certify(system), float(rtol), max_sweeps, meter)
         if checkpoint is not None:
             iteration.resume(checkpoint)
-        automatic = Krylov() if nodes is None else Jacobi()
-        (automatic if isinstance(solver, str) else solver).run(iteration)
-        solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes)
+        solver.run(iteration)
+        solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes, solver)
     if throw and not solution.converged:
         raise RuntimeError(f"solve: {solution.result}")
     return solution
+
+
+def _depth(scene: Scene, stuff: Materials) -> float:
+    """The largest optical depth along an axis of the lattice, or a little more."""
+    if stuff.extinction is None:
+        return 0.0
+    along = [float(jnp.max(jnp.sum(stuff.extinction, axis))) for axis in (1, 2, 3)]
+    return max(along) * scene.lattice.spacing
 
 
 def _exchanges(scene: Scene, stuff: Materials) -> bool:
@@ -110,8 +127,9 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
     if isinstance(scheme, LightRayCube) and quadrature is not None:
         got = f"{quadrature} with {scheme}"
         checks.fail("quadrature", got, "None", "the light ray cube has its own directions: leave quadrature out")
-    if not (isinstance(solver, Jacobi | Krylov) or solver == "auto"):
-        checks.fail("solver", repr(solver), 'rm.Jacobi(), rm.Krylov() or "auto"', 'leave it at "auto"')
+    if not (isinstance(solver, Jacobi | Krylov | Anderson | OptimistixFixedPoint) or solver == "auto"):
+        kinds = 'rm.Krylov(), rm.Anderson(), rm.OptimistixFixedPoint(...), rm.Jacobi() or "auto"'
+        checks.fail("solver", repr(solver), kinds, 'leave it at "auto"')
     if mesh is not None:
         checks.fail("mesh", repr(mesh), "None", "sweeps run on one device so far; leave mesh out")
     if checkpoint is not None:
@@ -124,8 +142,31 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
         )
 
 
+def _check_steady(scene: Scene, surfaces: Surfaces, stuff: Materials) -> None:
+    """Light must be able to end somewhere, if there is any."""
+    sources = [stuff.emission, *(f for f in (stuff.medium_source,) if f is not None)]
+    sources += [light.intensity for light in scene.lights if isinstance(light, PointLight)]
+    if checks.is_traced(stuff.albedo) or any(checks.is_traced(s) for s in sources):
+        return
+    lossless = np.all(np.asarray(stuff.albedo) >= 1, axis=1)
+    if stuff.absorption is not None:
+        lossless &= ~np.any(np.asarray(stuff.absorption) > 0, axis=(1, 2, 3))
+    if surfaces.open.any() or not lossless.any() or not any(np.any(np.asarray(s) > 0) for s in sources):
+        return
+    raise ValueError(
+        "scene: got sources in a closed scene where nothing absorbs (every albedo is 1), expected light to end somewhere: "
+        "there is no steady state; lower an albedo below 1, add absorption, or open a side"
+    )
+
+
 def _finish(
-    scene: Scene, surfaces: Surfaces, quadrature: Quadrature, stuff: Materials, iteration: Iteration, nodes: CubeSystem | None
+    scene: Scene,
+    surfaces: Surfaces,
+    quadrature: Quadrature,
+    stuff: Materials,
+    iteration: Iteration,
+    nodes: CubeSystem | None,
+    solver: object,
 ) -> Solution:
     system, bounced = iteration.system, iteration.arriving
     # Within its bound a Krylov iterate may dip below 0, where the exact solution is not.
@@ -152,7 +193,8 @@ def _finish(
         energy=_energy(scene, surfaces, quadrature, stuff, free, fields),
         error_bound=math.pi * iteration.bound, target=math.pi * iteration.target,
         history=math.pi * np.array(iteration.residuals[1:]), sweeps=iteration.sweeps + iteration.certificate.sweeps,
-        converged=iteration.converged, stagnated=iteration.stagnated,
+        ending=iteration.ending, solver=repr(solver), rounding=math.pi * iteration.rounding,
+        no_bound=iteration.certificate.reason if iteration.residuals[-1] > 0 else "",
         _hidden=_Hidden(surfaces),
     )  # fmt: skip
 

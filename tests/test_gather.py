@@ -48,8 +48,10 @@ def stand_in(scene: rm.Scene, irradiance: Any = 0.0, fluence: Any = 0.0) -> Solu
         target=0.0,
         history=np.zeros(0),
         sweeps=0,
-        converged=True,
-        stagnated=False,
+        ending="converged",
+        solver="none",
+        rounding=0.0,
+        no_bound="",
         _hidden=_Hidden(surfaces),
     )
 
