@@ -47,6 +47,8 @@ _MODULE_OF = {
     "OptimistixFixedPoint": "optimistix_solver",
     "Solution": "solution",
     "solve": "solve",
+    "ErrorEstimate": "error_estimate",
+    "estimate_error": "error_estimate",
     "fluence": "gather",
     "irradiance": "gather",
     "outgoing_flux": "gather",
@@ -69,6 +71,8 @@ if TYPE_CHECKING:
     from raymanifold_jax.checkpoint import Checkpoint as Checkpoint
     from raymanifold_jax.cost import CostReport as CostReport
     from raymanifold_jax.cost import cost_report as cost_report
+    from raymanifold_jax.error_estimate import ErrorEstimate as ErrorEstimate
+    from raymanifold_jax.error_estimate import estimate_error as estimate_error
     from raymanifold_jax.gather import fluence as fluence
     from raymanifold_jax.gather import irradiance as irradiance
     from raymanifold_jax.gather import outgoing_flux as outgoing_flux
