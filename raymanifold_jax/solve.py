@@ -30,6 +30,7 @@ from .quadrature import Quadrature, for_scene
 from .scene import OPEN, PointLight, Scene, Sky, Sun
 from .solution import Energy, Solution, _Hidden
 from .solvers import Anderson, Jacobi, Krylov, automatic
+from .source_checks import check_sources
 from .surfaces import Surfaces, find_surfaces
 from .transport.characteristic import Characteristic
 from .transport.light_ray_cube import LightRayCube
@@ -76,6 +77,7 @@ def solve(
     with meter:
         meter.start(f"solve {scene.summary()}")
         surfaces = find_surfaces(scene)
+        check_sources(scene, surfaces)
         stuff = materials(scene, surfaces)
         _check_steady(scene, surfaces, stuff)
         nodes = None if cube is None else make_cube_system(scene, surfaces, cube)
