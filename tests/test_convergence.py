@@ -45,6 +45,7 @@ def test_few_sweeps_at_any_albedo_and_depth(x64, surface, scattering, depth):
     assert difference(solution, tight) <= solution.error_bound + tight.error_bound
 
 
+@pytest.mark.slow
 def test_long_corridor_in_few_sweeps():
     # Vacuum, where light diffuses from wall to wall: six times fewer sweeps than without the preconditioner, at least.
     wall = rm.Wall(0.99)
@@ -98,7 +99,9 @@ SLABS = {"Ua-1-0-SL": (1.30, 0.93772556), "PUb-1-0-SL": (1.40, 0.73660355)}
 SPHERES = {"Ua-1-0-SP": (1.30, 2.4248249802)}
 
 
-@pytest.mark.parametrize(("c", "half"), SLABS.values(), ids=SLABS)
+@pytest.mark.parametrize(
+    ("c", "half"), [pytest.param(*v, id=k, marks=[pytest.mark.slow] * (k[0] == "U")) for k, v in SLABS.items()]
+)
 def test_orders_of_scattering_in_a_slab_fall_as_one_over_c(x64, c, half):
     # Error budget: 24 voxels of 0.08 mean free paths and one source each, 0.3 %; 400 directions, 0.3 %.
     n = 24
@@ -121,6 +124,7 @@ def test_orders_of_scattering_in_a_sphere_fall_as_one_over_c(x64, c, radius):
     assert _ratio_of_orders(scene, rm.quadrature.fibonacci(200)) == pytest.approx(1 / c, rel=1e-2)
 
 
+@functools.cache
 def _thick_slab(eps: float) -> float:
     """The fluence in the middle of a slab of thickness 1, extinction 1 / eps, absorption eps, source eps."""
     n = 16
@@ -133,7 +137,7 @@ def _thick_slab(eps: float) -> float:
     return float(solution.fluence[0, 0, n // 2])
 
 
-@pytest.mark.parametrize("eps", [1.0, 0.1, 0.01, 0.001])
+@pytest.mark.parametrize("eps", [*(pytest.param(eps, marks=pytest.mark.slow) for eps in (1.0, 0.01)), 0.1, 0.001])
 def test_thick_diffusion_limit_is_bounded(x64, eps):
     # The limit eps -> 0 is -phi'' / 3 + phi = 1, phi = 0 at the sides. Voxels with one source each leak more than diffusion
     # (as step characteristics do: Larsen, Morel & Miller, J. Comput. Phys. 69, 1987), so that the fluence falls short, but it
