@@ -25,8 +25,8 @@ from .layout import Layout, Ordinates, make_ordinates
 from .quadrature import Quadrature
 from .scene import Scene, Wall
 from .surfaces import Surfaces
-from .transport.characteristic import Inflow, SweptMedium, count_laps, mark_hits, sweep, thin_limit
-from .transport.transpose import transposed_sweep
+from .transport.characteristic import Inflow, count_laps, mark_hits, thin_limit
+from .transport.derivative import swept, unswept
 
 _MOST_LAPS = 1 << 16
 _ROUNDS = 1  # of Sinkhorn's iteration; each halves what bias is left, or better, and costs about four sweeps
@@ -165,10 +165,8 @@ def _factor(wanted: Array, sent: Array) -> Array:
     return jnp.clip(jnp.where(sent > 0, wanted / jnp.where(sent > 0, sent, 1.0), 1.0), 0.5, 2.0)
 
 
-@eqx.filter_jit
 def _transposed(layout: Layout, ordinates, extinction, thin: bool, asked: Light) -> Light:
-    medium = None if extinction is None else SweptMedium(extinction, jnp.zeros_like(extinction), thin)
-    return Light(*transposed_sweep(layout, ordinates, asked.elements, asked.voxels, medium))
+    return Light(*unswept(layout, ordinates, extinction, thin, asked.elements, asked.voxels))
 
 
 @jax.jit
@@ -176,14 +174,8 @@ def _ratio(sums: Array, furnace: Array) -> Array:
     return jnp.where(furnace > 0, sums / jnp.where(furnace > 0, furnace, 1.0), 0.0)
 
 
-# A program of its own: furnaces, bounces and first flights of one shape share it.
-@eqx.filter_jit
 def _sweep(layout, ordinates, extinction, thin, leaving: Light, inflow: Inflow | None, fluence: bool) -> Light:
-    medium = None
-    if extinction is not None:
-        dark = jnp.zeros((extinction.shape[0], *layout.shape), extinction.dtype)
-        medium = SweptMedium(extinction, layout.to_padded(dark if leaving.voxels is None else leaving.voxels), thin)
-    return Light(*sweep(layout, ordinates, leaving.elements, medium, inflow, fluence))
+    return Light(*swept(layout, ordinates, extinction, thin, leaving.elements, leaving.voxels, inflow, fluence))
 
 
 _mark_hits = eqx.filter_jit(mark_hits)

@@ -326,8 +326,8 @@ class _Fields(eqx.Module):
         return (self.exitance,) if self.source is None else (self.exitance, self.source)
 
     def sending(self, sent: tuple[Array, ...]) -> _Fields:
-        """The same geometry and extinction with other light."""
-        return dataclasses.replace(self, exitance=sent[0], source=None if self.source is None else sent[1])
+        """The same geometry with other light: exitance, source and, if given, extinction."""
+        return dataclasses.replace(self, **dict(zip(("exitance", "source", "extinction"), sent, strict=False)))
 
 
 def _chords(own: Ordinates, step: Int[Array, ""], width: int, wrap_v: bool) -> Chords:

@@ -1,0 +1,134 @@
+"""Sweeps that can be differentiated: by the sources they carry, and by the extinction they cross.
+
+`swept` is `sweep` and `unswept` is `transposed_sweep`, with fields of the lattice in and out, under JAX's transformations:
+forwards JAX differentiates them itself, backwards `adjoint_sweep` does. With K(s) for a sweep through the extinction s, the
+adjoints of (s, x) -> K x and (s, y) -> K'y share the form <y, K x>:
+
+    of K x:   x' = K'y,      s' = d<y, K x>/ds        (y the cotangent)
+    of K'y:   y' = K z,      s' = d<y, K z>/ds        (z the cotangent)
+
+Public: `swept`, `unswept`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ..adjoint import with_adjoint
+from ..layout import Layout, Ordinates
+from .characteristic import Inflow, SweptMedium, sweep
+from .transpose import adjoint_sweep, transposed_sweep
+
+Field = Float[Array, "C nx ny nz"]
+Results = tuple[Float[Array, "C E"], Field | None]
+
+
+def swept(
+    layout: Layout,
+    ordinates: tuple[Ordinates, ...],
+    extinction: Float[Array, "C X Y Z"] | None,
+    thin: bool,
+    exitance: Float[Array, "C E"],
+    source: Field | None,
+    inflow: Inflow | None,
+    fluence: bool,
+) -> Results:
+    """`sweep`: sums at the elements and, with `fluence`, in the voxels. `source` of None is a dark medium."""
+    return with_adjoint(_Sweep(thin, fluence), _SweepAdjoint(thin))(layout, ordinates, extinction, exitance, source, inflow)
+
+
+def unswept(
+    layout: Layout,
+    ordinates: tuple[Ordinates, ...],
+    extinction: Float[Array, "C X Y Z"] | None,
+    thin: bool,
+    at_elements: Float[Array, "C E"],
+    in_voxels: Field | None,
+) -> Results:
+    """`transposed_sweep`: what was sent, from weights of the sums."""
+    return with_adjoint(_Unsweep(thin), _UnsweepAdjoint(thin))(layout, ordinates, extinction, at_elements, in_voxels)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Sweep:
+    thin: bool
+    fluence: bool
+
+    def __call__(self, *arguments) -> Results:
+        return _sweep(self.thin, self.fluence, *arguments)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Unsweep:
+    thin: bool
+
+    def __call__(self, *arguments) -> Results:
+        return _unsweep(self.thin, *arguments)
+
+
+@dataclasses.dataclass(frozen=True)
+class _SweepAdjoint:
+    thin: bool
+
+    def __call__(self, arguments, wanted, weights: Results):
+        layout, ordinates, extinction, exitance, source, inflow = arguments
+        whole = _any(wanted[2]) or _any(None if inflow is None else wanted[5].factor)
+        entering = inflow if whole or _any(wanted[5]) else None
+        found = _adjoint(self.thin, whole, layout, ordinates, extinction, weights, exitance, source, entering)
+        light = None if inflow is None else Inflow(found.radiance, None if inflow.factor is None else found.factor)
+        # Only what is wanted is read: the geometry stands for itself.
+        return layout, ordinates, found.extinction, found.exitance, None if source is None else found.source, light
+
+
+@dataclasses.dataclass(frozen=True)
+class _UnsweepAdjoint:
+    thin: bool
+
+    def __call__(self, arguments, wanted, weights: Results):
+        layout, ordinates, extinction, at_elements, in_voxels = arguments
+        exitance, source = weights
+        fluence = in_voxels is not None
+        elements, voxels = _sweep(self.thin, fluence, layout, ordinates, extinction, exitance, source, None)
+        curve = None
+        if _any(wanted[2]):
+            asked = (at_elements, in_voxels)
+            curve = _adjoint(self.thin, True, layout, ordinates, extinction, asked, exitance, source, None).extinction
+        return layout, ordinates, curve, elements, voxels
+
+
+def _any(wanted: Any) -> bool:
+    return any(jax.tree.leaves(wanted))
+
+
+def _medium(layout: Layout, extinction, source, thin: bool, like: Array) -> SweptMedium | None:
+    if extinction is None:
+        return None
+    dark = jnp.zeros((extinction.shape[0], *layout.shape), like.dtype)
+    return SweptMedium(extinction, layout.to_padded(dark if source is None else source), thin)
+
+
+# Programs of their own: furnaces, bounces and first flights of one shape share them.
+
+
+@eqx.filter_jit
+def _sweep(thin: bool, fluence: bool, layout, ordinates, extinction, exitance, source, inflow) -> Results:
+    medium = _medium(layout, extinction, source, thin, exitance)
+    return sweep(layout, ordinates, exitance, medium, inflow, fluence)
+
+
+@eqx.filter_jit
+def _unsweep(thin: bool, layout, ordinates, extinction, at_elements, in_voxels) -> Results:
+    medium = _medium(layout, extinction, None, thin, at_elements)
+    return transposed_sweep(layout, ordinates, at_elements, in_voxels, medium)
+
+
+@eqx.filter_jit
+def _adjoint(thin: bool, whole: bool, layout, ordinates, extinction, weights: Results, exitance, source, inflow):
+    medium = _medium(layout, extinction, source, thin, weights[0])
+    return adjoint_sweep(layout, ordinates, *weights, exitance if whole else None, medium, inflow)
