@@ -235,5 +235,3 @@ def _batch(arrays, axes, *, map):
 
 
 batching.primitive_batchers[_linear_p] = _batch
-
-

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from . import checks
 from .layout import Layout
 from .march import transmittance
 from .operator import Light, Materials, Transport, make_transport
@@ -48,7 +49,7 @@ def first_flight(
     """All light that arrives straight from sources."""
     layout = transport.layout
     dark = _dark(materials)
-    emits = jax.tree.map(jnp.any, Light(materials.emission, materials.medium_source))
+    emits = jax.tree.map(checks.may_differ_from_zero, Light(materials.emission, materials.medium_source))
     sky = sky_inflow(scene, layout, quadrature)
     if sky is None and not any(jax.tree.leaves(emits)):
         nothing = jnp.zeros((scene.bands, *layout.shape), materials.emission.dtype)
@@ -58,7 +59,7 @@ def first_flight(
     if (points := small_emitters(scene, surfaces)) is not None:
         # The elements' share of the emitters' light is taken exactly; the sweep's share of it is taken out.
         exact = _conserved(scene, surfaces, points) / jnp.pi
-        if sky is not None or bool(emits.voxels):
+        if sky is not None or emits.voxels:
             exact = exact + transport(Light(dark.elements, materials.medium_source), sky).elements
         swept = Light(exact, swept.voxels)
     for light in scene.lights:
@@ -132,7 +133,7 @@ class EmitterPoints(eqx.Module):
 def small_emitters(scene: Scene, surfaces: Surfaces) -> EmitterPoints | None:
     """Points on the emitting surfaces, if these are a small part of all surfaces; else None."""
     owners = [*scene.solids, *scene.boundary.sides]
-    emits = np.array([bool(np.any(np.asarray(getattr(o, "emission", 0.0)) > 0)) for o in owners], bool)
+    emits = np.array([checks.may_differ_from_zero(getattr(o, "emission", 0.0)) for o in owners], bool)
     emitters = np.nonzero(emits[surfaces.material])[0] if len(surfaces) else []
     if not len(emitters) or surfaces.area[emitters].sum() > _SMALL * surfaces.area.sum():
         return None

@@ -14,13 +14,16 @@ Public: `Light`, `Transport`, `make_transport`, `Materials`, `materials`.
 from __future__ import annotations
 
 import dataclasses
+from contextlib import nullcontext
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
+from . import checks
 from .layout import Layout, Ordinates, make_ordinates
 from .quadrature import Quadrature
 from .scene import Scene, Wall
@@ -118,6 +121,13 @@ class Transport(eqx.Module):
         sums = _sweep(self.layout, self.ordinates, self.extinction, self.thin, leaving, inflow, fluence)
         return _means(sums, Light(self.element_sums, self.voxel_sums))
 
+    def transposed(self, asked: Light) -> Light:
+        """The transpose in what leaves: weights of arriving light back to weights of what was sent."""
+        sums = Light(self.element_sums, None if asked.voxels is None else self.voxel_sums)
+        weights = jax.tree.map(_ratio, asked, sums)
+        sent = _transposed(self.layout, self.ordinates, self.extinction, self.thin, weights)
+        return _balanced(self.factors, sent, None)[0]
+
 
 @eqx.filter_jit
 def _balanced(factors: Light | None, leaving: Light, inflow: Inflow | None) -> tuple[Light, Inflow | None]:
@@ -179,6 +189,7 @@ def _sweep(layout, ordinates, extinction, thin, leaving: Light, inflow: Inflow |
 
 
 _mark_hits = eqx.filter_jit(mark_hits)
+_count_laps = eqx.filter_jit(count_laps)
 
 
 def _furnace(transport: Transport, leaving: Light) -> Light:
@@ -206,21 +217,30 @@ def make_transport(
 
     **Raises** `ValueError` where rays along a periodic axis never end.
     """
+    # What no parameter moves is worked out now, even while JAX traces the rest.
+    with nullcontext() if checks.is_traced(extinction) else jax.ensure_compile_time_eval():
+        return _make_transport(layout, quadrature, extinction, bands, mirrored, area)
+
+
+def _make_transport(layout: Layout, quadrature: Quadrature, extinction, bands: int, mirrored: bool, area) -> Transport:
     if mirrored and layout.unfolding.axes:
         quadrature = quadrature.mirrored(layout.unfolding.axes)
     largest_plane = int(np.prod(sorted(layout.padded)[1:]))
-    ordinates = make_ordinates(quadrature, bands, largest_plane)
+    with jax.ensure_compile_time_eval():
+        ordinates = _mark_hits(layout, make_ordinates(quadrature, bands, largest_plane))
     padded = None if extinction is None else layout.to_padded(extinction)
-    thin = extinction is not None and bool(jnp.max(extinction) * (np.sqrt(3) * layout.spacing) <= thin_limit(extinction.dtype))
+    thin = extinction is not None and checks.surely(
+        jnp.max(extinction) * (np.sqrt(3) * layout.spacing) <= thin_limit(extinction.dtype)
+    )
     if 0 in layout.pad:
-        ordinates, longest = eqx.filter_jit(count_laps)(layout, ordinates, padded, _MOST_LAPS)
-        if int(longest) >= _MOST_LAPS:
+        ordinates, longest = _count_laps(layout, ordinates, lax.stop_gradient(padded), _MOST_LAPS)
+        if checks.surely(longest >= _MOST_LAPS):
             raise ValueError(
                 f"boundary: some rays are still going after {_MOST_LAPS} laps of a periodic axis; expected every ray to meet "
                 "a surface, an open side or an absorbing medium; close or open another side, or add absorption"
             )
     ones = lambda *shape: jnp.ones((bands, *shape), layout.plane.dtype)
-    transport = Transport(layout, _mark_hits(layout, ordinates), padded, ones(), ones(), ones(), thin)
+    transport = Transport(layout, ordinates, padded, ones(), ones(), ones(), thin)
     sums = _furnace(transport, Light(ones(layout.elements), None if extinction is None else ones(*layout.shape)))
     assert sums.voxels is not None
     fields = {"element_sums": sums.elements, "voxel_sums": sums.voxels, "coverage": sums.voxels[0]}

@@ -72,7 +72,7 @@ class Solution(eqx.Module):
     - `surfaces`: positions, normals, areas, albedo, irradiance, radiosity, one row for each element.
     - `energy`: the power balance and its imbalance.
     - `error_bound`: certified: no radiosity, and no medium source times pi, is further than this from the exact solution of
-      the discrete problem (in radiosity units; rounding apart). inf where no bound is known.
+      the discrete problem (in radiosity units; rounding apart). inf where no bound is known, nan under `jit` and `vmap`.
     - `sweeps`: applications of the transport operator on the full lattice. `history`: the largest residual after each
       sweep, in radiosity units. `result`: how the iteration ended, in words; `converged`: whether it met the tolerance.
     - `diffuse_*` and `sun_*`: (bands, ...), the light of the suns' direct beams, and all other light.
@@ -147,6 +147,8 @@ class Solution(eqx.Module):
     def result(self) -> str:
         """How the iteration ended."""
         bound, target, count = self.error_bound, self.target, self.sweeps
+        if np.isnan(bound):
+            return "solved inside a program that JAX traced (jit, vmap), which keeps no bound"
         if self.converged:
             return f"converged: error bound {bound:.3g} is within the target {target:.3g} after {count} sweeps"
         if not np.isfinite(bound):

@@ -9,15 +9,18 @@ Public: `solve`.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from . import checks
 from .checkpoint import Checkpoint
 from .direct import first_flight, sky_radiance
+from .implicit import Unwatched, attach, stop_gradient
 from .iteration import Iteration, Jacobi, Krylov, System, certify
 from .layout import make_layout
 from .memory import check_memory
@@ -71,31 +74,48 @@ def solve(
     meter = make_progress(progress)
     with meter:
         meter.start(f"solve {scene.summary()}")
-        surfaces = find_surfaces(scene)
+        with jax.ensure_compile_time_eval():
+            surfaces = find_surfaces(scene)
         stuff = materials(scene, surfaces)
         nodes = None if cube is None else make_cube_system(scene, surfaces, cube)
         if nodes is not None:
             system, quadrature = nodes.system, nodes.quadrature
         else:
-            layout = make_layout(scene, surfaces)
+            with jax.ensure_compile_time_eval():
+                layout = make_layout(scene, surfaces)
             area = surfaces.area if _exchanges(scene, stuff) else None
             transport = make_transport(layout, quadrature, stuff.extinction, scene.bands, area=area)
             system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff))
-        iteration = Iteration(system, certify(system), float(rtol), max_sweeps, meter)
-        if checkpoint is not None:
-            iteration.resume(checkpoint)
         automatic = Krylov() if nodes is None else Jacobi()
-        (automatic if isinstance(solver, str) else solver).run(iteration)
+        chosen = automatic if isinstance(solver, str) else solver
+        iteration = _iterate(system, float(rtol), chosen, max_sweeps, meter, checkpoint)
         solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes)
     if throw and not solution.converged:
         raise RuntimeError(f"solve: {solution.result}")
     return solution
 
 
+def _iterate(
+    system: Any, rtol: float, solver: Jacobi | Krylov, most: int, meter: Progress, checkpoint: Checkpoint | None
+) -> Iteration | Unwatched:
+    traced = checks.is_traced(system)
+    known = stop_gradient(system) if traced else system
+    if checks.is_traced(known):
+        iteration = Unwatched(system, rtol, most)
+    else:
+        iteration = Iteration(known, certify(known), rtol, most, meter)
+        if checkpoint is not None:
+            iteration.resume(checkpoint)
+        solver.run(iteration)
+    if traced:
+        iteration.system, iteration.arriving = system, attach(system, iteration.arriving, rtol, most)
+    return iteration
+
+
 def _exchanges(scene: Scene, stuff: Materials) -> bool:
     """Whether anything sends light through the sweeps of the solve: else nothing needs balancing."""
     fields = (stuff.albedo, stuff.emission, stuff.scattering_albedo, stuff.medium_source)
-    return any(isinstance(light, Sky) for light in scene.lights) or any(bool(jnp.any(f > 0)) for f in fields if f is not None)
+    return any(isinstance(light, Sky) for light in scene.lights) or any(map(checks.may_differ_from_zero, fields))
 
 
 def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint) -> None:
@@ -110,6 +130,14 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
     if isinstance(scheme, LightRayCube) and quadrature is not None:
         got = f"{quadrature} with {scheme}"
         checks.fail("quadrature", got, "None", "the light ray cube has its own directions: leave quadrature out")
+    geometry: list[Any] = [solid.shape for solid in scene.solids]
+    geometry += [getattr(light, name, None) for light in scene.lights for name in ("direction", "position", "hemisphere")]
+    if checks.is_traced(geometry):
+        expected = "shapes and directions of lights that JAX does not trace"
+        advice = "close over the scene, and put parameters in with equinox.tree_at: what is in front of what has no derivative"
+        checks.fail("scene", "traced geometry", expected, advice, TypeError)
+    if isinstance(scheme, LightRayCube) and checks.is_traced(scene):
+        checks.fail("scheme", f"{scheme} with traced values", "rm.Characteristic()", "only its sweeps have derivatives")
     if not (isinstance(solver, Jacobi | Krylov) or solver == "auto"):
         checks.fail("solver", repr(solver), 'rm.Jacobi(), rm.Krylov() or "auto"', 'leave it at "auto"')
     if mesh is not None:
@@ -125,11 +153,16 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
 
 
 def _finish(
-    scene: Scene, surfaces: Surfaces, quadrature: Quadrature, stuff: Materials, iteration: Iteration, nodes: CubeSystem | None
+    scene: Scene,
+    surfaces: Surfaces,
+    quadrature: Quadrature,
+    stuff: Materials,
+    iteration: Iteration | Unwatched,
+    nodes: CubeSystem | None,
 ) -> Solution:
     system, bounced = iteration.system, iteration.arriving
     # Within its bound a Krylov iterate may dip below 0, where the exact solution is not.
-    bounced = jax.tree.map(lambda x: jnp.maximum(x, 0.0), bounced)
+    bounced = jax.tree.map(lambda x: x + lax.stop_gradient(jnp.maximum(-x, 0.0)), bounced)
     if not system.scatters:  # the iteration did not need the light in the voxels
         everywhere = system.transport(system.materials.reflected(system.source + bounced), fluence=True)
         bounced = Light(bounced.elements, everywhere.voxels)

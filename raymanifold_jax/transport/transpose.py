@@ -1,9 +1,9 @@
 """The transposed sweep: from what is read at elements and voxels, back to what was sent.
 
-A coordinate evolution is linear in the elements' exitance, the medium's source and the light that enters. Its transpose runs the
-planes backwards: each plane first takes up what its elements and voxels ask for (the transposed reads), then hands the rays on
-to the plane before. The step through one plane is the sweep's own, transposed by JAX; geometry and attenuation are worked out
-again on the way, so that nothing is kept from a forward sweep.
+A coordinate evolution is linear in the elements' exitance, the medium's source and the light that enters. Its transpose runs
+the planes backwards: each plane first takes up what its elements and voxels ask for (the transposed reads), then hands the
+rays on to the plane before. The step through one plane is the sweep's own, transposed by JAX; geometry and attenuation are
+worked out again on the way, so that nothing is kept from a forward sweep.
 
 In the extinction a sweep is not linear. Its derivative, for weights y of the results,
 
