@@ -23,6 +23,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.core import ShapedArray, Tracer
 from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -37,7 +38,7 @@ class _Map:
 
     forward: Callable
     backward: Callable
-    derivative: Callable | None
+    derivative: _Derivatives | None
     residuals: Any  # tree structures
     operand: Any
     result: Any
@@ -70,7 +71,7 @@ class _Derivatives:
     backward: Callable
 
 
-def _swap(derivative):
+def _swap(derivative: _Derivatives | None) -> _Derivatives | None:
     return None if derivative is None else _Derivatives(derivative.backward, derivative.forward)
 
 
@@ -165,7 +166,7 @@ def _run(*arrays, map):
 
 @_linear_p.def_abstract_eval
 def _shapes(*arrays, map):
-    return [jax.core.ShapedArray(s.shape, s.dtype) for s in map.result_shapes]
+    return [ShapedArray(s.shape, s.dtype) for s in map.result_shapes]
 
 
 mlir.register_lowering(_linear_p, mlir.lower_fun(lambda *arrays, map: map.run(*arrays), multiple_results=True))
@@ -226,7 +227,7 @@ def _batch(arrays, axes, *, map):
             full[i] = value
         return _linear_p.bind(*full, map=map)
 
-    known = not any(isinstance(a, jax.core.Tracer) for a in arrays)
+    known = not any(isinstance(a, Tracer) for a in arrays)
     if known:
         results = [one([s[k] for s in stacked]) for k in range(size)]
         return [jnp.stack(r) for r in zip(*results, strict=True)], [0] * len(results[0])

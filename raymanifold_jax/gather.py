@@ -17,6 +17,7 @@ import weakref
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -320,10 +321,18 @@ def _lift(scene: Scene, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     _check_depth(scene, "points", points, _DEEP, "on a surface", advice)
     spacing = lattice.spacing
     for _ in range(2 if len(points) and scene.solids else 1):
-        near = np.asarray(in_blocks(Scene.distance, scene, (points,)), np.float64) if len(points) else np.zeros(0)
+        with jax.ensure_compile_time_eval():
+            near = (
+                np.asarray(in_blocks(Scene.distance, _untraced(scene), (points,)), np.float64) if len(points) else np.zeros(0)
+            )
         points = points + np.maximum(_OFF * spacing - near, 0.0)[:, None] * normals
     margin = _OFF * spacing
     return np.clip(points, lattice.lower + margin, lattice.upper - margin)
+
+
+def _untraced(scene: Scene) -> Scene:
+    """The same geometry, with any numbers for values that are traced."""
+    return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype) if checks.is_traced(leaf) else leaf, scene)
 
 
 def _box(scene: Scene) -> str:

@@ -12,7 +12,8 @@ Public: `transmittance`, `march`, `fill`, `interpolate`; for blocks of rays `tra
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from .adjoint import with_adjoint
 from .scene import Scene
 from .unfolding import Axis, box_span, in_blocks, sloped, to_voxel, unfolded_axes
 
@@ -84,6 +86,14 @@ def interpolate(scene: Scene, filled: Float[Array, "C nx ny nz"], u: Float[Array
 
 
 def _interpolate(axes: tuple[Axis, ...], flat: Array, u: tuple[Array, ...]) -> Array:
+    total = jnp.zeros((flat.shape[0], *u[0].shape), flat.dtype)
+    for weight, voxel in _corners(axes, u):
+        total = total + weight * flat.at[:, voxel].get(mode="promise_in_bounds")
+    return total
+
+
+def _corners(axes: tuple[Axis, ...], u: tuple[Array, ...]) -> Iterator[tuple[Array, Array]]:
+    """The eight voxels around points, with their weights."""
     corners = []
     for axis, x in zip(axes, u, strict=True):
         floor = jnp.floor(x - 0.5)
@@ -91,12 +101,10 @@ def _interpolate(axes: tuple[Axis, ...], flat: Array, u: tuple[Array, ...]) -> A
         index = floor.astype(jnp.int32)
         corners.append(((1 - after, axis.fold_index(index)), (after, axis.fold_index(index + 1))))
     ny, nz = axes[1].count, axes[2].count
-    total = jnp.zeros((flat.shape[0], *u[0].shape), flat.dtype)
     for a, i in corners[0]:
         for b, j in corners[1]:
             for c, k in corners[2]:
-                total = total + (a * b * c) * flat.at[:, (i * ny + j) * nz + k].get(mode="promise_in_bounds")
-    return total
+                yield a * b * c, (i * ny + j) * nz + k
 
 
 def _coefficients(scene: Scene) -> list[Array]:
@@ -131,8 +139,8 @@ def transmittance_between(scene: Scene, o: Array, w: Array, start: Array, stop: 
     if extinction.shape[1] == 1:
         depth = extinction * ((stop - start) * spacing)
     else:
-        add = lambda depth, middle, voxel, length: depth + _at(extinction, voxel) * (length * spacing)
-        depth = _walk(unfolded_axes(scene), o, w, start, stop, add, jnp.zeros((len(extinction), len(o)), o.dtype))
+        axes = unfolded_axes(scene)
+        depth = with_adjoint(_Depth(axes), _DepthAdjoint(axes))(extinction, o, w, start, stop) * spacing
     return jnp.broadcast_to(jnp.exp(-depth), (scene.bands, len(o))).T
 
 
@@ -149,20 +157,99 @@ def march_between(context: tuple[Scene, Array], origins: Array, directions: Arra
     w = sloped(directions)
     o = to_voxel(scene, origins + start[:, None] * directions)
     length = jnp.maximum(stop - start, 0.0) / spacing
-    coefficients = _coefficients(scene)
+    coefficients = tuple(c * spacing for c in _coefficients(scene))
     uniform = all(c.shape[1] == 1 for c in coefficients)
-
-    def add(state, middle, voxel, step):
-        radiance, depth = state
-        scattering, absorption, emission = (_at(c, voxel) for c in coefficients)
-        source = scattering / (4 * jnp.pi) * _interpolate(axes, flat, middle) + emission
-        own = (scattering + absorption) * (step * spacing)
-        return radiance + jnp.exp(-depth) * source * (step * spacing) * _share(own), depth + own
-
-    state = (jnp.zeros(shape, o.dtype), jnp.zeros(shape, o.dtype))
-    advance = _stride if uniform else _walk
-    radiance, depth = advance(axes, o, w, jnp.zeros_like(length), length, add, state)
+    how = _March(axes, scene.bands, uniform), _MarchAdjoint(axes, scene.bands, uniform)
+    radiance, depth = with_adjoint(*how)(coefficients, flat, o, w, length)
     return radiance.T, jnp.exp(-depth).T
+
+
+@dataclasses.dataclass(frozen=True)
+class _Depth:
+    """Sums of a coefficient (b, V) over the lengths of rays in voxels: (b, n)."""
+
+    axes: tuple[Axis, ...]
+
+    def __call__(self, extinction: Array, o: Array, w: Array, start: Array, stop: Array) -> Array:
+        add = lambda depth, middle, voxel, length: depth + _at(extinction, voxel) * length
+        return _walk(self.axes, o, w, start, stop, add, jnp.zeros((len(extinction), len(o)), o.dtype))
+
+
+@dataclasses.dataclass(frozen=True)
+class _DepthAdjoint:
+    axes: tuple[Axis, ...]
+
+    def __call__(self, arguments, wanted, weights: Array):
+        extinction, o, w, start, stop = arguments
+        add = lambda total, middle, voxel, length: total.at[:, voxel].add(weights * length)
+        return _walk(self.axes, o, w, start, stop, add, jnp.zeros_like(extinction)), None, None, None, None
+
+
+@dataclasses.dataclass(frozen=True)
+class _March:
+    """Radiance added along rays and their optical depths, (C, n) each, of coefficients (b, V) per voxel's side."""
+
+    axes: tuple[Axis, ...]
+    bands: int
+    uniform: bool
+
+    def __call__(self, coefficients: tuple[Array, ...], flat: Array, o: Array, w: Array, length: Array):
+        def add(state, middle, voxel, step):
+            radiance, depth = state
+            added, own = _added(tuple(_at(c, voxel) for c in coefficients), _interpolate(self.axes, flat, middle), depth, step)
+            return radiance + added, depth + own
+
+        nothing = jnp.zeros((self.bands, len(o)), o.dtype)
+        return self.advance(o, w, length, add, (nothing, nothing))
+
+    def advance(self, o: Array, w: Array, length: Array, add: Callable, state: Any) -> Any:
+        return (_stride if self.uniform else _walk)(self.axes, o, w, jnp.zeros_like(length), length, add, state)
+
+
+def _added(coefficients: tuple[Array, ...], fluence: Array, depth: Array, step: Array) -> tuple[Array, Array]:
+    """The radiance that one segment sends through the depth before it, and its own depth."""
+    scattering, absorption, emission = coefficients
+    source = scattering / (4 * jnp.pi) * fluence + emission
+    own = (scattering + absorption) * step
+    return jnp.exp(-depth) * source * step * _share(own), jnp.broadcast_to(own, depth.shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class _MarchAdjoint:
+    """By a second march: of all that lies behind a segment, the total radiance minus that so far, its depth takes a share."""
+
+    axes: tuple[Axis, ...]
+    bands: int
+    uniform: bool
+
+    def __call__(self, arguments, wanted, weights: tuple[Array, Array]):
+        coefficients, flat, o, w, length = arguments
+        march = _March(self.axes, self.bands, self.uniform)
+        total, _ = march(*arguments)
+
+        def add(state, middle, voxel, step):
+            radiance, depth, sums, spread = state
+            fluence = _interpolate(self.axes, flat, middle)
+            one = lambda values, fluence: _added(values, fluence, depth, step)
+            (added, own), back = jax.vjp(one, tuple(_at(c, voxel) for c in coefficients), fluence)
+            radiance = radiance + added
+            to_values, to_fluence = back((weights[0], weights[1] - (total - radiance) * weights[0]))
+            sums = tuple(_put(s, voxel, v) for s, v in zip(sums, to_values, strict=True))
+            for weight, corner in _corners(self.axes, middle):
+                spread = spread.at[:, corner].add(weight * to_fluence)
+            return radiance, depth + own, sums, spread
+
+        nothing = jnp.zeros((self.bands, len(o)), o.dtype)
+        state = (nothing, nothing, jax.tree.map(jnp.zeros_like, coefficients), jnp.zeros_like(flat))
+        _, _, sums, spread = march.advance(o, w, length, add, state)
+        return sums, spread, None, None, None
+
+
+def _put(total: Array, voxel: Array | None, values: Array) -> Array:
+    """The transpose of `_at`."""
+    if total.shape[1] == 1 or voxel is None:
+        return total + values.sum(1, keepdims=True)
+    return total.at[:, voxel].add(values)
 
 
 def _at(coefficient: Array, voxel: Array | None) -> Array:

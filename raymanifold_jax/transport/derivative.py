@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .. import checks
 from ..adjoint import with_adjoint
 from ..layout import Layout, Ordinates
 from .characteristic import Inflow, SweptMedium, sweep
@@ -78,10 +79,14 @@ class _SweepAdjoint:
 
     def __call__(self, arguments, wanted, weights: Results):
         layout, ordinates, extinction, exitance, source, inflow = arguments
-        whole = _any(wanted[2]) or _any(None if inflow is None else wanted[5].factor)
-        entering = inflow if whole or _any(wanted[5]) else None
-        found = _adjoint(self.thin, whole, layout, ordinates, extinction, weights, exitance, source, entering)
-        light = None if inflow is None else Inflow(found.radiance, None if inflow.factor is None else found.factor)
+        if _any(wanted[2]) or _any(None if inflow is None else wanted[5].factor):
+            found = _whole_adjoint(self.thin, layout, ordinates, extinction, weights, exitance, source, inflow)
+        else:
+            entering = inflow if _any(wanted[5]) else None
+            found = _adjoint(self.thin, False, layout, ordinates, extinction, weights, exitance, source, entering)
+        light: Any = None
+        if inflow is not None:
+            light = Inflow(found.radiance, None if inflow.factor is None else found.factor)  # pyright: ignore
         # Only what is wanted is read: the geometry stands for itself.
         return layout, ordinates, found.extinction, found.exitance, None if source is None else found.source, light
 
@@ -98,8 +103,25 @@ class _UnsweepAdjoint:
         curve = None
         if _any(wanted[2]):
             asked = (at_elements, in_voxels)
-            curve = _adjoint(self.thin, True, layout, ordinates, extinction, asked, exitance, source, None).extinction
+            curve = _whole_adjoint(self.thin, layout, ordinates, extinction, asked, exitance, source, None).extinction
         return layout, ordinates, curve, elements, voxels
+
+
+def _whole_adjoint(thin: bool, layout: Layout, ordinates, extinction, weights: Results, exitance, source, inflow):
+    """Everything's derivative. What is missing is given as nothing, so that all calls share one program: it is a large one."""
+    real, bands = exitance.dtype, exitance.shape[0]
+    images = len(layout.unfolding.images())
+    if inflow is None and not checks.is_traced(ordinates):
+        count = 1 + max(int(jnp.max(o.index, initial=0)) for o in ordinates)
+        inflow = Inflow(jnp.zeros((images, count, bands), real))
+    if inflow is not None and inflow.factor is None:
+        inflow = Inflow(inflow.radiance, jnp.ones((bands, layout.elements), real))
+    at_elements, in_voxels = weights
+    if extinction is not None:
+        dark = jnp.zeros((bands, *layout.shape), real)
+        source = dark if source is None else source
+        in_voxels = dark if in_voxels is None else in_voxels
+    return _adjoint(thin, True, layout, ordinates, extinction, (at_elements, in_voxels), exitance, source, inflow)
 
 
 def _any(wanted: Any) -> bool:

@@ -261,7 +261,8 @@ def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, w
             return totals
 
         def lap(n, carry):
-            return backwards(-(n + 1) * track.count, at_start(own.laps - 2 - n), *carry, False)
+            rays, totals = carry
+            return backwards(-(n + 1) * track.count, at_start(own.laps - 2 - n), rays, totals, False)
 
         return lax.fori_loop(0, own.laps - 1, lap, (rays, totals))[1]
 
