@@ -36,6 +36,7 @@ _MODULE_OF = {
     "Sun": "scene",
     "Wall": "scene",
     "Checkpoint": "checkpoint",
+    "Texture": "texture",
     "load": "load",
     "Characteristic": "transport.characteristic",
     "LightRayCube": "transport.light_ray_cube",
@@ -97,6 +98,7 @@ if TYPE_CHECKING:
     from raymanifold_jax.shapes import Torus as Torus
     from raymanifold_jax.solution import Solution as Solution
     from raymanifold_jax.solve import solve as solve
+    from raymanifold_jax.texture import Texture as Texture
     from raymanifold_jax.transport.characteristic import Characteristic as Characteristic
     from raymanifold_jax.transport.light_ray_cube import LightRayCube as LightRayCube
     from raymanifold_jax.voxels import Voxels as Voxels

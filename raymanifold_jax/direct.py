@@ -24,6 +24,7 @@ from . import checks
 from .layout import Layout
 from .march import transmittance
 from .operator import Light, Materials, Transport, make_transport
+from .prepare import Prepared
 from .quadrature import Quadrature
 from .scene import OPEN, PointLight, Scene, Sky, Sun, Wall
 from .surfaces import Surfaces, patch_points
@@ -44,7 +45,12 @@ class Direct(eqx.Module):
 
 
 def first_flight(
-    scene: Scene, surfaces: Surfaces, transport: Transport, quadrature: Quadrature, materials: Materials
+    scene: Scene,
+    surfaces: Surfaces,
+    transport: Transport,
+    quadrature: Quadrature,
+    materials: Materials,
+    prepared: Prepared | None = None,
 ) -> Direct:
     """All light that arrives straight from sources."""
     layout = transport.layout
@@ -66,7 +72,7 @@ def first_flight(
         if isinstance(light, PointLight):
             swept = swept + _from_point(scene, surfaces, light)
     zero = jax.tree.map(jnp.zeros_like, swept)
-    suns = [_from_sun(scene, surfaces, layout, light, materials) for light in scene.lights if isinstance(light, Sun)]
+    suns = [_from_sun(scene, surfaces, layout, light, materials, prepared) for light in scene.lights if isinstance(light, Sun)]
     return Direct(sun=sum(suns, start=zero), rest=swept)
 
 
@@ -99,13 +105,17 @@ def _dark(materials: Materials) -> Light:
     return Light(jnp.zeros_like(materials.emission), voxels)
 
 
-def _from_sun(scene: Scene, surfaces: Surfaces, layout: Layout, sun: Sun, materials: Materials) -> Light:
+def _from_sun(
+    scene: Scene, surfaces: Surfaces, layout: Layout, sun: Sun, materials: Materials, prepared: Prepared | None
+) -> Light:
     side = (np.arange(_SUN_OFFSETS) + 0.5) / _SUN_OFFSETS
     offsets = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
     count = len(offsets)
     direction = np.asarray(sun.direction)
     beam = Quadrature(np.tile(direction, (count, 1)), np.full(count, 1 / count), offsets, "sun")
-    transport = _beam_transport(layout, beam, materials.extinction, scene.bands)
+    make = lambda: _beam_transport(layout, beam, materials.extinction, scene.bands)
+    key = ("sun", *direction.tolist(), scene.bands)
+    transport = make() if prepared is None else prepared.transport(key, materials.extinction, make)
     images = layout.unfolding.images()
     irradiance = jnp.broadcast_to(sun.irradiance, (scene.bands,))
     # Only the scene itself is lit; a mirror image of it gets what mirrors reflect.

@@ -26,8 +26,9 @@ from . import checks
 from .direct import emitter_irradiance, sky_radiance, small_emitters
 from .interpolation import ElementTable, element_table, interpolate_irradiance, slopes
 from .march import fill, interpolate, march_between, transmittance, transmittance_between
-from .scene import MIRROR, OPEN, PERIODIC, PointLight, Scene, Sun, Wall
+from .scene import MIRROR, OPEN, PERIODIC, PointLight, Scene, Solid, Sun, Wall
 from .solution import Solution
+from .texture import Texture, value_at
 from .trace import Hit, trace_rays, visible
 from .unfolding import in_blocks, sloped, to_voxel
 
@@ -176,7 +177,7 @@ def _light_field(solution: Solution) -> LightField:
         table=table,
         irradiance=values,
         slope=slopes(scene, table, values),
-        albedo=jnp.stack([spread(o, "albedo") for o in owners]),
+        albedo=jnp.stack([spread(None if o is None or isinstance(o.albedo, Texture) else o, "albedo") for o in owners]),
         emission=jnp.stack([spread(o, "emission") for o in owners]),
     )
 
@@ -188,8 +189,17 @@ def surface_radiance(field: LightField, hit: Hit) -> Float[Array, "n C"]:
     arriving = interpolate_irradiance(scene, field.table, field.irradiance, field.slope, u, hit.normal)
     arriving = arriving + _sun_irradiance(scene, hit.point + _OFF * scene.lattice.spacing * hit.normal, hit.normal)
     material = jnp.maximum(hit.material, 0)
-    leaving = field.albedo[material] / jnp.pi * arriving + field.emission[material]
+    leaving = _albedo(field, material, hit.point) / jnp.pi * arriving + field.emission[material]
     return jnp.where((hit.material >= 0)[:, None], leaving, 0.0)
+
+
+def _albedo(field: LightField, material: Array, points: Array) -> Float[Array, "n C"]:
+    scene, albedo = field.scene, field.albedo[material]
+    for number, owner in enumerate([*scene.solids, *scene.boundary.sides]):
+        if isinstance(owner, Solid | Wall) and isinstance(owner.albedo, Texture):
+            here = value_at(owner.albedo, scene.lattice, points, scene.bands)
+            albedo = jnp.where((material == number)[:, None], here, albedo)
+    return albedo
 
 
 def radiance_along(field: LightField, origins: Array, directions: Array) -> Float[Array, "n C"]:

@@ -24,10 +24,12 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from . import checks
+from .lattice import Lattice
 from .layout import Layout, Ordinates, make_ordinates
 from .quadrature import Quadrature
 from .scene import Scene, Wall
-from .surfaces import Surfaces
+from .surfaces import Surfaces, patch_points
+from .texture import Texture, mean_values
 from .transport.characteristic import Inflow, count_laps, mark_hits, thin_limit
 from .transport.derivative import swept, unswept
 
@@ -82,9 +84,15 @@ def materials(scene: Scene, surfaces: Surfaces) -> Materials:
     spread = lambda value: jnp.broadcast_to(jnp.asarray(value, real), (bands,))
     none = jnp.zeros((bands,), real)
     owners = [*scene.solids, *(side if isinstance(side, Wall) else None for side in scene.boundary.sides)]
-    albedo = jnp.stack([none if o is None else spread(o.albedo) for o in owners], axis=1)
+    plain = [none if o is None or isinstance(o.albedo, Texture) else spread(o.albedo) for o in owners]
     emission = jnp.stack([none if o is None else spread(o.emission) for o in owners], axis=1)
     owner = jnp.asarray(surfaces.material, np.int32)
+    albedo = jnp.stack(plain, axis=1)[:, owner]
+    for number, o in enumerate(owners):
+        if o is not None and isinstance(o.albedo, Texture):
+            rows = np.nonzero(surfaces.material == number)[0]
+            points, weight = _face_points(scene.lattice, surfaces, rows)
+            albedo = albedo.at[:, rows].set(mean_values(o.albedo, scene.lattice, points, weight, bands))
     medium = dict.fromkeys(("scattering_albedo", "medium_source", "extinction", "absorption"))
     if scene.medium is not None:
         shape = (*scene.lattice.shape, bands)
@@ -100,7 +108,14 @@ def materials(scene: Scene, surfaces: Surfaces) -> Materials:
             "scattering_albedo": scattering / divisor, "medium_source": source / divisor, "extinction": extinction,
             "absorption": absorption,
         }  # fmt: skip
-    return Materials(albedo[:, owner], emission[:, owner], **medium)
+    return Materials(albedo, emission[:, owner], **medium)
+
+
+def _face_points(lattice: Lattice, surfaces: Surfaces, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points on the faces of some elements, and the area of each."""
+    patch, weight = patch_points(surfaces.normal[rows], surfaces.offset[rows])
+    center = lattice.lower + (surfaces.voxel[rows] + 0.5) * lattice.spacing
+    return center[:, None] + patch * lattice.spacing, weight
 
 
 class Transport(eqx.Module):

@@ -22,14 +22,14 @@ from .checkpoint import Checkpoint
 from .direct import first_flight, sky_radiance
 from .implicit import Unwatched, attach, stop_gradient
 from .iteration import Iteration, Jacobi, Krylov, System, certify
-from .layout import make_layout
 from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
+from .prepare import Prepared, prepare
 from .progress import Progress, make_progress
 from .quadrature import Quadrature, fibonacci
 from .scene import OPEN, PointLight, Scene, Sky, Sun
 from .solution import Energy, Solution, _Hidden
-from .surfaces import Surfaces, find_surfaces
+from .surfaces import Surfaces
 from .transport.characteristic import Characteristic
 from .transport.light_ray_cube import LightRayCube
 from .transport.ray_cube_system import CubeSystem, make_cube_system
@@ -48,6 +48,7 @@ def solve(
     progress: bool | Progress | None = None,
     mesh: None = None,
     checkpoint: Checkpoint | None = None,
+    prepared: Prepared | None = None,
 ) -> Solution:
     """Solve a scene for the light everywhere.
 
@@ -63,6 +64,8 @@ def solve(
       straight from the sources, and k bounces. With `throw`, that raises `RuntimeError`; without, read
       `Solution.converged` and `Solution.result`.
     - `checkpoint`: an `rm.Checkpoint`, in which the iteration keeps its state, and from which it may go on.
+    - `prepared`: what `prepare(scene)` gave for a scene of the same shapes, lattice and kinds of sides, to save time; pass
+      the same `quadrature` each time as well.
     - `progress`: True or None shows a bar on a terminal when the solve takes long; False never; or a `Progress`.
 
     **Raises** `ValueError` or `TypeError` for unusable arguments before any work, `RuntimeError` with `throw`.
@@ -74,18 +77,17 @@ def solve(
     meter = make_progress(progress)
     with meter:
         meter.start(f"solve {scene.summary()}")
-        with jax.ensure_compile_time_eval():
-            surfaces = find_surfaces(scene)
+        prepared = prepare(scene) if prepared is None else prepared
+        surfaces = prepared.surfaces
         stuff = materials(scene, surfaces)
         nodes = None if cube is None else make_cube_system(scene, surfaces, cube)
         if nodes is not None:
             system, quadrature = nodes.system, nodes.quadrature
         else:
-            with jax.ensure_compile_time_eval():
-                layout = make_layout(scene, surfaces)
             area = surfaces.area if _exchanges(scene, stuff) else None
-            transport = make_transport(layout, quadrature, stuff.extinction, scene.bands, area=area)
-            system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff))
+            make = lambda: make_transport(prepared.layout, quadrature, stuff.extinction, scene.bands, area=area)
+            transport = prepared.transport((id(quadrature), scene.bands, area is None), stuff.extinction, make)
+            system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff, prepared))
         automatic = Krylov() if nodes is None else Jacobi()
         chosen = automatic if isinstance(solver, str) else solver
         iteration = _iterate(system, float(rtol), chosen, max_sweeps, meter, checkpoint)
