@@ -37,6 +37,12 @@ _MODULE_OF = {
     "Wall": "scene",
     "Checkpoint": "checkpoint",
     "Texture": "texture",
+    "Fit": "fit",
+    "Parameter": "fit",
+    "fit": "fit",
+    "FluenceTarget": "targets",
+    "IrradianceTarget": "targets",
+    "PictureTarget": "targets",
     "load": "load",
     "Characteristic": "transport.characteristic",
     "LightRayCube": "transport.light_ray_cube",
@@ -68,6 +74,9 @@ if TYPE_CHECKING:
     from raymanifold_jax.checkpoint import Checkpoint as Checkpoint
     from raymanifold_jax.cost import CostReport as CostReport
     from raymanifold_jax.cost import cost_report as cost_report
+    from raymanifold_jax.fit import Fit as Fit
+    from raymanifold_jax.fit import Parameter as Parameter
+    from raymanifold_jax.fit import fit as fit
     from raymanifold_jax.gather import fluence as fluence
     from raymanifold_jax.gather import irradiance as irradiance
     from raymanifold_jax.gather import outgoing_flux as outgoing_flux
@@ -98,6 +107,9 @@ if TYPE_CHECKING:
     from raymanifold_jax.shapes import Torus as Torus
     from raymanifold_jax.solution import Solution as Solution
     from raymanifold_jax.solve import solve as solve
+    from raymanifold_jax.targets import FluenceTarget as FluenceTarget
+    from raymanifold_jax.targets import IrradianceTarget as IrradianceTarget
+    from raymanifold_jax.targets import PictureTarget as PictureTarget
     from raymanifold_jax.texture import Texture as Texture
     from raymanifold_jax.transport.characteristic import Characteristic as Characteristic
     from raymanifold_jax.transport.light_ray_cube import LightRayCube as LightRayCube
