@@ -106,7 +106,7 @@ def _dark(materials: Materials) -> Light:
 
 
 def _from_sun(
-    scene: Scene, surfaces: Surfaces, layout: Layout, sun: Sun, materials: Materials, prepared: Prepared | None
+    scene: Scene, surfaces: Surfaces, layout: Layout, sun: Sun, materials: Materials, prepared: Prepared | None = None
 ) -> Light:
     side = (np.arange(_SUN_OFFSETS) + 0.5) / _SUN_OFFSETS
     offsets = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
