@@ -104,7 +104,8 @@ def with_adjoint(function: Callable, adjoint: Callable) -> Callable:
 
     `adjoint` gets the tuple of arguments, the same tree with True where a leaf's cotangent is wanted, and the result's
     cotangent; it returns a tree like the arguments, with anything (None too) where nothing is wanted. Both are of modules, or
-    compare as equal where they are the same.
+    compare as equal where they are the same. A method function.push(arguments, moves), if there is one, may give the derivative
+    along `moves` (None where nothing moves), or None to leave it to JAX.
     """
 
     @jax.custom_jvp
@@ -134,6 +135,13 @@ class _Push:
     active: tuple[bool, ...]
 
     def __call__(self, leaves, tangents):
+        known = getattr(self.function, "push", None)
+        if known is not None:
+            given = iter(tangents)
+            moves = self.tree.unflatten([next(given) if on else None for on in self.active])
+            if (result := known(self.tree.unflatten(leaves), moves)) is not None:
+                return result
+
         def moving(*values):
             given = iter(values)
             full = [next(given) if on else leaf for on, leaf in zip(self.active, leaves, strict=True)]

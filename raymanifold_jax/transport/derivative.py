@@ -64,6 +64,17 @@ class _Sweep:
     def __call__(self, *arguments) -> Results:
         return _sweep(self.thin, self.fluence, *arguments)
 
+    def push(self, arguments, moves) -> Results | None:
+        """Where only what is carried moves: another sweep, by the same program."""
+        layout, ordinates, extinction, exitance, source, inflow = arguments
+        _, _, crossed, moved, emitted, light = moves
+        if crossed is not None or (light is not None and light.factor is not None):
+            return None
+        moved = jnp.zeros_like(exitance) if moved is None else moved
+        emitted = jnp.zeros_like(source) if emitted is None and source is not None else emitted
+        entering = None if light is None or light.radiance is None else Inflow(light.radiance, inflow.factor)
+        return _sweep(self.thin, self.fluence, layout, ordinates, extinction, moved, emitted, entering)
+
 
 @dataclasses.dataclass(frozen=True)
 class _Unsweep:
@@ -71,6 +82,15 @@ class _Unsweep:
 
     def __call__(self, *arguments) -> Results:
         return _unsweep(self.thin, *arguments)
+
+    def push(self, arguments, moves) -> Results | None:
+        layout, ordinates, extinction, at_elements, in_voxels = arguments
+        _, _, crossed, elements, voxels = moves
+        if crossed is not None:
+            return None
+        elements = jnp.zeros_like(at_elements) if elements is None else elements
+        voxels = jnp.zeros_like(in_voxels) if voxels is None and in_voxels is not None else voxels
+        return _unsweep(self.thin, layout, ordinates, extinction, elements, voxels)
 
 
 @dataclasses.dataclass(frozen=True)
