@@ -25,19 +25,22 @@ class Prepared:
 
     def __init__(self, surfaces: Surfaces, layout: Layout):
         self.surfaces, self.layout = surfaces, layout
-        self._kept: dict[Hashable, tuple[np.ndarray | None, Any]] = {}
+        self._kept: dict[Hashable, tuple[np.ndarray | None, Any, Any]] = {}
 
-    def transport(self, key: Hashable, extinction: jax.Array | None, make: Callable[[], Any]) -> Any:
-        """`make()`, or what it gave before for the same `key` and an equal `extinction`."""
+    def transport(self, key: Hashable, extinction: jax.Array | None, make: Callable[[], Any], alive: Any = None) -> Any:
+        """`make()`, or what it gave before for the same `key` and an equal `extinction`.
+
+        `alive` is kept as well: an object whose id is part of the key.
+        """
         if checks.is_traced(extinction):
             return make()
         now = None if extinction is None else np.asarray(extinction)
-        before, kept = self._kept.get(key, (None, None))
+        before, kept, _ = self._kept.get(key, (None, None, None))
         same = kept is not None and (now is before or (now is not None and before is not None and np.array_equal(now, before)))
         if not same:
             kept = make()
             if not checks.is_traced(kept):
-                self._kept[key] = now, kept
+                self._kept[key] = now, kept, alive
         return kept
 
 

@@ -50,7 +50,7 @@ def render(
         origins, directions = camera.rays(samples, (start, stop))
         seen = in_blocks(radiance_along, field, (origins.reshape(-1, 3), directions.reshape(-1, 3)))
         shape = (stop - start, width, samples, bands)
-        parts.append(seen.reshape(shape).mean(2) if traced else np.asarray(seen, np.float32).reshape(shape).mean(2))
+        parts.append(seen.reshape(shape).mean(2) if traced else np.asarray(seen).reshape(shape).mean(2).astype(np.float32))
         if progress is not None:
             progress(stop / height)
     picture: Any = jnp.concatenate(parts) if traced else np.concatenate(parts)

@@ -70,7 +70,7 @@ def solve(
 
     **Raises** `ValueError` or `TypeError` for unusable arguments before any work, `RuntimeError` with `throw`.
     """
-    _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint)
+    _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint, prepared)
     cube = scheme if isinstance(scheme, LightRayCube) else None
     quadrature = fibonacci(_DEFAULT_DIRECTIONS) if quadrature is None else quadrature
     check_memory(scene.lattice.shape, scene.bands, len(quadrature), scene.medium is not None)
@@ -86,7 +86,7 @@ def solve(
         else:
             area = surfaces.area if _exchanges(scene, stuff) else None
             make = lambda: make_transport(prepared.layout, quadrature, stuff.extinction, scene.bands, area=area)
-            transport = prepared.transport((id(quadrature), scene.bands, area is None), stuff.extinction, make)
+            transport = prepared.transport((id(quadrature), scene.bands, area is None), stuff.extinction, make, quadrature)
             system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff, prepared))
         automatic = Krylov() if nodes is None else Jacobi()
         chosen = automatic if isinstance(solver, str) else solver
@@ -120,7 +120,7 @@ def _exchanges(scene: Scene, stuff: Materials) -> bool:
     return any(isinstance(light, Sky) for light in scene.lights) or any(map(checks.may_differ_from_zero, fields))
 
 
-def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint) -> None:
+def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint, prepared) -> None:
     checks.instance("scene", scene, Scene, "make one with rm.Scene(lattice, solids=[...], ...)")
     if quadrature is not None:
         checks.instance("quadrature", quadrature, Quadrature, "use rm.quadrature.fibonacci(200)")
@@ -146,6 +146,11 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
         checks.fail("mesh", repr(mesh), "None", "sweeps run on one device so far; leave mesh out")
     if checkpoint is not None:
         checks.instance("checkpoint", checkpoint, Checkpoint, 'pass rm.Checkpoint("run.npz")')
+    if prepared is not None:
+        checks.instance("prepared", prepared, Prepared, "pass what prepare(scene) returns")
+        if prepared.layout.shape != scene.lattice.shape:
+            got = f"what was prepared for {prepared.layout.shape} voxels"
+            checks.fail("prepared", got, f"the scene's {scene.lattice.shape}", "prepare the scene itself")
     checks.positive_int("max_sweeps", max_sweeps)
     finest = 16 * float(jnp.finfo(jnp.zeros(0).dtype).eps)
     if not (isinstance(rtol, (int, float, np.floating)) and math.isfinite(rtol) and finest <= rtol < 1):
