@@ -99,9 +99,11 @@ def materials(scene: Scene, surfaces: Surfaces) -> Materials:
         outside = jnp.asarray(~surfaces.solid)
         fields = [jnp.moveaxis(jnp.broadcast_to(c, shape), -1, 0) for c in scene.medium.coefficients()]
         scattering, absorption, source = (jnp.where(outside, f, 0.0).astype(real) for f in fields)
-        # An emitting voxel that neither absorbs nor scatters has no source function: give it a trace of absorption.
+        # A voxel that neither absorbs nor scatters has no source function: give it a trace of absorption if it emits, or may
+        # become one that does or scatters.
         trace = _TRACE / scene.lattice.spacing
-        absorption = jnp.where((source > 0) & (scattering + absorption < trace), trace, absorption)
+        needed = (source > 0) | checks.is_traced(scene.medium)
+        absorption = absorption + jnp.where(needed & (scattering + absorption < trace), trace, 0.0)
         extinction = scattering + absorption
         divisor = jnp.where(extinction > 0, extinction, 1.0)
         medium = {
