@@ -52,6 +52,10 @@ def solve(
 ) -> Solution:
     """Solve a scene for the light everywhere.
 
+    JAX differentiates the solution in every physical value of the scene, forwards and backwards, at about the cost of one more
+    solve (`implicit`); shapes, and directions and positions of lights, have no derivative. Under `jit` and `vmap` no error
+    bound is known (`Solution.error_bound` is nan).
+
     **Arguments:**
 
     - `quadrature`: directions of the sweeps; `rm.quadrature.fibonacci(200)` if None. More directions reduce ray effects; time
@@ -68,7 +72,8 @@ def solve(
       the same `quadrature` each time as well.
     - `progress`: True or None shows a bar on a terminal when the solve takes long; False never; or a `Progress`.
 
-    **Raises** `ValueError` or `TypeError` for unusable arguments before any work, `RuntimeError` with `throw`.
+    **Raises** `ValueError` or `TypeError` for unusable arguments, traced shapes among them, before any work, `RuntimeError` with
+    `throw`.
     """
     _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint, prepared)
     cube = scheme if isinstance(scheme, LightRayCube) else None

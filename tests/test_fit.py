@@ -75,8 +75,8 @@ def test_what_no_target_sees_is_reported():
 @pytest.mark.slow
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_floor_of_the_ring_scene_from_four_views(noise):
-    # A 16 x 16 texture from four pictures of 32 x 32 pixels. Noise-free, 1 % rms is asked. With noise of 1 % of the mean pixel a
-    # cell has some 7 pixels in all, fewer where the ring hides it: 1.1 % rms was found, and 2 % is asked.
+    # A 16 x 16 texture from four pictures of 32 x 32 pixels. Noise-free, 1 % rms is asked. With noise of 1 % of the mean
+    # pixel a cell has some 7 pixels in all, fewer where the ring hides it: 1.1 % rms was found, and 2 % is asked.
     base = rm.scenes.ring(16)
     rng = np.random.default_rng(0)
     i, j = np.mgrid[:16, :16]

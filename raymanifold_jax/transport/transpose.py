@@ -10,7 +10,8 @@ In the extinction a sweep is not linear. Its derivative, for weights y of the re
     d<y, sweep> / d extinction = sum over planes of  (adjoint rays) . d(step through the plane) / d extinction,
 
 needs the rays as they were where they entered each plane: one chunk of directions is swept forwards once more, and its rays
-are kept plane by plane: planes x chunk numbers, about one lattice's worth for each direction of a chunk.
+are kept plane by plane: planes x chunk numbers, about one lattice's worth for each direction of a chunk. Around a periodic axis
+every lap is reached from the start again: time grows with the square of the laps.
 
 Public: `transposed_sweep`, `adjoint_sweep`, `Adjoint`.
 """
