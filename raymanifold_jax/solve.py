@@ -72,8 +72,8 @@ def solve(
       the same `quadrature` each time as well.
     - `progress`: True or None shows a bar on a terminal when the solve takes long; False never; or a `Progress`.
 
-    **Raises** `ValueError` or `TypeError` for unusable arguments, traced shapes among them, before any work, `RuntimeError` with
-    `throw`.
+    **Raises** `ValueError` or `TypeError` for unusable arguments, traced shapes among them, before any work; `RuntimeError`
+    with `throw`.
     """
     _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint, prepared)
     cube = scheme if isinstance(scheme, LightRayCube) else None
