@@ -12,6 +12,8 @@ import click
 _QUESTIONS = {
     "accuracy": "How far from known answers is the solver, and what does that cost?",
     "error-vs-time": "Which size, how many directions and which quadrature give the smallest error in a given time?",
+    "stability": "Does a solve stay finite, non-negative and within its bound where numbers are extreme?",
+    "convergence": "How many sweeps to a certified error of 1e-4, over albedos and optical depths?",
     "peer": "How long do we take for an error of 1 %, and how long does a path tracer on the same cores?",
 }
 
@@ -65,7 +67,7 @@ def main() -> None:
 @_sizes("Voxels along the longest side; may be repeated. [default: the size each problem's target is meant for]")
 @click.option("--all-sizes", is_flag=True, help="All of each problem's own sizes.")
 @click.option("--directions", type=_at_least(9), metavar="N", help="[default: 200; with --quick 60]")
-@click.option("--quadrature", default="fibonacci", show_default=True, metavar="NAME", help="The kind of set.")
+@click.option("--quadrature", default="default", show_default=True, metavar="NAME", help="The kind of set.")
 @_repeats
 @_json
 def accuracy(
@@ -199,11 +201,52 @@ def peer(
     click.echo(result.table())
 
 
-def _check_quadrature(name: str) -> None:
-    from .measure import QUADRATURES
+@main.command()
+@click.option("--quick", is_flag=True, help="The ends of each range only.")
+@_json
+def stability(quick: bool, json_file: Path | None) -> None:
+    """Extreme depths, albedos, contrasts, radiances, directions and shapes; float32 against float64."""
+    from .record import environment, write
+    from .stability import cases, measure, stability_table
 
-    if name not in QUADRATURES:
-        raise click.UsageError(f"--quadrature: got {name!r}, expected one of {', '.join(QUADRATURES)}")
+    rows = []
+    for case in cases(quick):
+        rows.append(measure(case, _tell))
+        write(json_file, _QUESTIONS["stability"], rows, environment=environment())
+    _print_environment(environment())
+    click.echo(stability_table(rows))
+    if any(row["verdict"] != "ok" for row in rows):
+        raise SystemExit(1)
+
+
+@main.command()
+@click.option("--quick", is_flag=True, help="The ends of each range only.")
+@click.option("--size", type=_at_least(2), default=32, show_default=True, help="Voxels along a side.")
+@click.option("--directions", type=_at_least(9), default=200, show_default=True)
+@click.option("--jacobi", type=_at_least(0), default=200, show_default=True, help="Its sweeps; the rest is extrapolated.")
+@click.option("--out", type=_NewFile(), metavar="FILE.png", help="Draw Jacobi's false convergence there (extra: plot).")
+@_json
+def convergence(quick: bool, size: int, directions: int, jacobi: int, out: Path | None, json_file: Path | None) -> None:
+    """Sweeps and time of the default solver and of Jacobi, in a foggy room; in float64."""
+    from .convergence import convergence_table, false_convergence, measure, rooms
+    from .record import environment, write
+
+    rows = []
+    for room in rooms(quick):
+        rows.append(measure(room, size, directions, jacobi, _tell))
+        write(json_file, _QUESTIONS["convergence"], rows, environment=environment())
+    if out is not None:
+        false_convergence(out)
+        click.echo(f"wrote {out}", err=True)
+    _print_environment(environment())
+    click.echo(convergence_table(rows))
+
+
+def _check_quadrature(name: str) -> None:
+    from .measure import DEFAULT, QUADRATURES
+
+    if name not in (DEFAULT, *QUADRATURES):
+        raise click.UsageError(f"--quadrature: got {name!r}, expected {DEFAULT} or one of {', '.join(QUADRATURES)}")
 
 
 def _tell(text: str) -> None:

@@ -43,10 +43,17 @@ def _fibonacci(count: int) -> "Quadrature":
     return rm.quadrature.fibonacci(count)
 
 
+def _cube(count: int) -> "Quadrature":
+    import raymanifold_jax as rm
+
+    return rm.quadrature.cube(2 * max(1, round(math.sqrt(count / 24))))
+
+
 #: By name: a number of directions to the quadrature whose own number is nearest.
 QUADRATURES: Mapping[str, Callable[[int], "Quadrature"]] = MappingProxyType(
-    {"fibonacci": _fibonacci, "light-ray-cube": _light_ray_cube, "product": _product}
+    {"fibonacci": _fibonacci, "cube": _cube, "light-ray-cube": _light_ray_cube, "product": _product}
 )
+DEFAULT = "default"  # what `rm.solve` takes
 
 
 @dataclass(frozen=True)
@@ -56,7 +63,7 @@ class Job:
     problem: str
     size: int
     directions: int
-    quadrature: str = "fibonacci"
+    quadrature: str = DEFAULT
     repeats: int = 1
 
 
@@ -68,7 +75,9 @@ def measure(job: Job) -> dict[str, Any]:
     import raymanifold_jax as rm
 
     case = problems.CASES[job.problem]
-    scene, quadrature = case.build(job.size), QUADRATURES[job.quadrature](job.directions)
+    scene = case.build(job.size)
+    chosen = QUADRATURES.get(job.quadrature, lambda count: rm.quadrature.for_scene(scene, count))
+    quadrature = chosen(job.directions)
 
     def solve() -> rm.Solution:
         solution = rm.solve(scene, quadrature, rtol=case.rtol, progress=False)

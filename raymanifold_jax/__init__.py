@@ -48,8 +48,10 @@ _MODULE_OF = {
     "LightRayCube": "transport.light_ray_cube",
     "CostReport": "cost",
     "cost_report": "cost",
-    "Jacobi": "iteration",
-    "Krylov": "iteration",
+    "Anderson": "solvers",
+    "Jacobi": "solvers",
+    "Krylov": "solvers",
+    "OptimistixFixedPoint": "optimistix_solver",
     "Solution": "solution",
     "solve": "solve",
     "fluence": "gather",
@@ -81,12 +83,11 @@ if TYPE_CHECKING:
     from raymanifold_jax.gather import irradiance as irradiance
     from raymanifold_jax.gather import outgoing_flux as outgoing_flux
     from raymanifold_jax.gather import radiance as radiance
-    from raymanifold_jax.iteration import Jacobi as Jacobi
-    from raymanifold_jax.iteration import Krylov as Krylov
     from raymanifold_jax.lattice import Lattice as Lattice
     from raymanifold_jax.load import load as load
     from raymanifold_jax.mesh import Mesh as Mesh
     from raymanifold_jax.mesh import MeshReport as MeshReport
+    from raymanifold_jax.optimistix_solver import OptimistixFixedPoint as OptimistixFixedPoint
     from raymanifold_jax.render import render as render
     from raymanifold_jax.scene import MIRROR as MIRROR
     from raymanifold_jax.scene import OPEN as OPEN
@@ -107,6 +108,9 @@ if TYPE_CHECKING:
     from raymanifold_jax.shapes import Torus as Torus
     from raymanifold_jax.solution import Solution as Solution
     from raymanifold_jax.solve import solve as solve
+    from raymanifold_jax.solvers import Anderson as Anderson
+    from raymanifold_jax.solvers import Jacobi as Jacobi
+    from raymanifold_jax.solvers import Krylov as Krylov
     from raymanifold_jax.targets import FluenceTarget as FluenceTarget
     from raymanifold_jax.targets import IrradianceTarget as IrradianceTarget
     from raymanifold_jax.targets import PictureTarget as PictureTarget

@@ -281,7 +281,7 @@ def _solve(
     options: dict[str, Any] = {} if checkpoint is None else {"checkpoint": rm.Checkpoint(checkpoint, resume=resume)}
     solution = rm.solve(
         scene,
-        quadrature=rm.quadrature.fibonacci(directions),
+        quadrature=rm.quadrature.for_scene(scene, directions),
         rtol=rtol,
         max_sweeps=max_sweeps,
         progress=not (quiet or no_progress),

@@ -8,8 +8,9 @@
 
   with visibility V by sphere tracing and transmittance T. Their light in the medium's voxels comes by the sweep (point lights:
   from the points as well).
+- Compact emitting parts of the medium: straight to elements and voxels (see `volume_sources`).
 
-Public: `Direct`, `first_flight`, `emitter_irradiance`, `small_emitters`.
+Public: `Direct`, `first_flight`, `emitter_light`, `small_emitters`.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from . import checks
 from .layout import Layout
-from .march import transmittance
+from .march import fill, transmittance
 from .operator import Light, Materials, Transport, make_transport
 from .prepare import Prepared
 from .quadrature import Quadrature
@@ -30,10 +31,12 @@ from .scene import OPEN, PointLight, Scene, Sky, Sun, Wall
 from .surfaces import Surfaces, patch_points
 from .trace import visible
 from .transport.characteristic import Inflow
+from .volume_sources import VolumeSources, compact_sources, volume_light
 
 _SUN_OFFSETS = 4  # rays a voxel, a side
 _EMITTER_POINTS = 576
 _SMALL = 0.1  # emitters that cover less of the surfaces than this are sampled by points
+_NEAR = 6  # widths of an emitter point's area
 _PAIRS = 1 << 18  # receiver-point pairs at once
 
 
@@ -55,25 +58,32 @@ def first_flight(
     """All light that arrives straight from sources."""
     layout = transport.layout
     dark = _dark(materials)
-    emits = jax.tree.map(checks.may_differ_from_zero, Light(materials.emission, materials.medium_source))
     sky = sky_inflow(scene, layout, quadrature)
-    if sky is None and not any(jax.tree.leaves(emits)):
-        nothing = jnp.zeros((scene.bands, *layout.shape), materials.emission.dtype)
-        swept = Light(dark.elements, nothing)
-    else:
-        swept = transport(Light(materials.emission, materials.medium_source), sky)
+    compact = compact_sources(scene, surfaces)
+    glow = materials.medium_source
+    if compact is not None and glow is not None:
+        glow = jnp.where(jnp.asarray(compact.emission > 0), 0.0, glow)
+    swept = _swept(transport, Light(materials.emission, glow), sky)
     if (points := small_emitters(scene, surfaces)) is not None:
         # The elements' share of the emitters' light is taken exactly; the sweep's share of it is taken out.
-        exact = _conserved(scene, surfaces, points) / jnp.pi
-        if sky is not None or emits.voxels:
-            exact = exact + transport(Light(dark.elements, materials.medium_source), sky).elements
-        swept = Light(exact, swept.voxels)
+        others = _swept(transport, Light(dark.elements, glow), sky).elements
+        swept = Light(others + _conserved(scene, surfaces, points) / jnp.pi, swept.voxels)
+    if compact is not None:
+        swept = swept + _from_volumes(scene, surfaces, compact)
     for light in scene.lights:
         if isinstance(light, PointLight):
             swept = swept + _from_point(scene, surfaces, light)
     zero = jax.tree.map(jnp.zeros_like, swept)
     suns = [_from_sun(scene, surfaces, layout, light, materials, prepared) for light in scene.lights if isinstance(light, Sun)]
     return Direct(sun=sum(suns, start=zero), rest=swept)
+
+
+def _swept(transport: Transport, leaving: Light, sky: Inflow | None) -> Light:
+    """One sweep of what leaves surfaces and medium and of the sky; none if all are dark."""
+    if sky is None and not checks.may_differ_from_zero(leaving):
+        shape = (leaving.elements.shape[0], *transport.layout.shape)
+        return Light(jnp.zeros_like(leaving.elements), jnp.zeros(shape, leaving.elements.dtype))
+    return transport(leaving, sky)
 
 
 def sky_inflow(scene: Scene, layout: Layout, quadrature: Quadrature) -> Inflow | None:
@@ -129,7 +139,7 @@ def _from_sun(
 
 def _beam_transport(layout: Layout, beam: Quadrature, extinction, bands: int) -> Transport:
     # A beam is no quadrature of the sphere: it is swept as it is, not reduced to one side of the mirrors.
-    return make_transport(layout, beam, extinction, bands, mirrored=False)
+    return make_transport(layout, beam, extinction, bands, beam=True)
 
 
 class EmitterPoints(eqx.Module):
@@ -138,6 +148,12 @@ class EmitterPoints(eqx.Module):
     position: Float[np.ndarray, "m 3"]
     normal: Float[np.ndarray, "m 3"]
     power: Float[Array, "C m"]  # radiance times area
+    width: float = eqx.field(static=True)  # of the area that a point stands for
+
+    def near(self, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
+        """Whether some points are so near to an emitter that its points are seen one by one."""
+        nearest = [((self.position - p) ** 2).sum(-1).min() for p in np.asarray(points)]
+        return np.array(nearest) < (_NEAR * self.width) ** 2
 
 
 def small_emitters(scene: Scene, surfaces: Surfaces) -> EmitterPoints | None:
@@ -163,14 +179,15 @@ def small_emitters(scene: Scene, surfaces: Surfaces) -> EmitterPoints | None:
     area = (surfaces.area[emitters][:, None] * share)[keep]
     owner = np.broadcast_to(surfaces.material[emitters][:, None], keep.shape)[keep]
     radiance = jnp.stack([jnp.broadcast_to(getattr(o, "emission", jnp.zeros(())), (scene.bands,)) for o in owners], 1)
-    return EmitterPoints(position[keep], normal[keep], radiance[:, owner] * jnp.asarray(area, radiance.dtype))
+    power = radiance[:, owner] * jnp.asarray(area, radiance.dtype)
+    return EmitterPoints(position[keep], normal[keep], power, float(np.sqrt(area.max())))
 
 
-def emitter_irradiance(
-    scene: Scene, points: EmitterPoints, position: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]
+def emitter_light(
+    scene: Scene, points: EmitterPoints, position: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"] | None
 ) -> Float[Array, "C n"]:
-    """Irradiance at surface points from emitter points, with exact visibility and transmittance."""
-    return _all_pairs(scene, points, position, normal)[0]
+    """Irradiance at surface points from emitter points, or fluence, with exact visibility and transmittance."""
+    return _all_pairs(scene, points, position, np.zeros_like(position) if normal is None else normal)[0]
 
 
 def _all_pairs(scene: Scene, points: EmitterPoints, position: np.ndarray, normal: np.ndarray) -> Float[Array, "2 C n"]:
@@ -208,6 +225,7 @@ def _pairs(scene: Scene, points: EmitterPoints, position, normal) -> Float[Array
     squared = jnp.maximum(jnp.sum(to**2, -1), (0.05 * scene.lattice.spacing) ** 2)
     leaving = -jnp.einsum("nmi,mi->nm", to, towards)
     arriving = jnp.einsum("nmi,ni->nm", to, normal)
+    arriving = jnp.where(jnp.any(normal != 0, -1)[:, None], arriving, jnp.sqrt(squared))  # no normal: fluence
     geometry = jnp.maximum(leaving, 0.0) * jnp.maximum(arriving, 0.0) / squared**2
     starts = jnp.broadcast_to(start[:, None], to.shape).reshape(-1, 3)
     ends = jnp.broadcast_to((end + clearance * towards)[None], to.shape).reshape(-1, 3)
@@ -216,6 +234,18 @@ def _pairs(scene: Scene, points: EmitterPoints, position, normal) -> Float[Array
     irradiance = jnp.einsum("cnm,cm->cn", passed.reshape(-1, *geometry.shape), points.power)
     unattenuated = jnp.einsum("nm,cm->cn", seen.reshape(geometry.shape), points.power)
     return jnp.stack([irradiance, unattenuated])
+
+
+def _from_volumes(scene: Scene, surfaces: Surfaces, sources: VolumeSources) -> Light:
+    """First-flight light of compact volume sources, at the elements and at the voxels' centres."""
+    at_elements = volume_light(scene, sources, surfaces.position, surfaces.normal)
+    known = ~surfaces.solid
+    known[tuple(surfaces.voxel[surfaces.side < 0].T)] = False  # whose centres may lie in a solid
+    (where,) = np.nonzero(known.ravel())
+    found = volume_light(scene, sources, scene.lattice.centers().reshape(-1, 3)[where])
+    in_voxels = jnp.zeros((scene.bands, known.size), found.dtype).at[:, where].set(found).reshape(-1, *known.shape)
+    in_voxels = fill(in_voxels, jnp.asarray(known, found.dtype)) * jnp.asarray(~surfaces.solid)
+    return Light(at_elements / jnp.pi, in_voxels / (4 * jnp.pi))
 
 
 def _from_point(scene: Scene, surfaces: Surfaces, light: PointLight) -> Light:

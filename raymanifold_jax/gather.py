@@ -23,7 +23,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import checks
-from .direct import emitter_irradiance, sky_radiance, small_emitters
+from .direct import emitter_light, sky_radiance, small_emitters
+from .directions import cosine_hemisphere, frames, whole_sphere
 from .interpolation import ElementTable, element_table, interpolate_irradiance, slopes
 from .march import fill, interpolate, march_between, transmittance, transmittance_between
 from .scene import MIRROR, OPEN, PERIODIC, PointLight, Scene, Solid, Sun, Wall
@@ -31,10 +32,12 @@ from .solution import Solution
 from .texture import Texture, value_at
 from .trace import Hit, trace_rays, visible
 from .unfolding import in_blocks, sloped, to_voxel
+from .volume_sources import compact_sources, emission_of, volume_light, with_emission
 
 _OFF = 2e-3  # voxels: how far off a surface rays start
 _DEEP = 0.5  # voxels: how far inside a solid a point on its surface may be by mistake
 _POINTS = 256  # points of a final gather at once
+_BLOCKS = 5  # of a volume source, along each axis, for one of the solve's
 _SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 
@@ -70,8 +73,8 @@ def irradiance(solution: Solution, points: Any, normals: Any, directions: int = 
     """Irradiance at surface points by a final gather, (n, 3) each, in W m^-2.
 
     The mean of the radiance over `directions` directions spread over the hemisphere around each normal, and the light
-    of suns, point lights and small emitting surfaces exactly. The normals may have any length but 0. Points up to half
-    a voxel inside a solid or outside the lattice are taken to be on the surface.
+    of suns, point lights, small emitting surfaces and compact volume sources exactly. The normals may have any length but
+    0. Points up to half a voxel inside a solid or outside the lattice are taken to be on the surface.
 
     **Raises** `TypeError` for anything but a solution, `ValueError` for NaN, another shape, a normal of length 0, or points
     further inside.
@@ -79,37 +82,23 @@ def irradiance(solution: Solution, points: Any, normals: Any, directions: int = 
     _check_solution(solution)
     points, normals = _rays(points, normals, "points", "normals")
     number = checks.positive_int("directions", directions)
-    scene, spacing = solution.scene, solution.scene.lattice.spacing
-    points = _lift(scene, points, normals)
-    field = light_field(solution)
-    emitters = small_emitters(scene, solution.elements) if not _has_images(scene) else None
-    if emitters is not None:
-        field = eqx.tree_at(lambda f: f.emission, field, jnp.zeros_like(field.emission))
-    local = _hemisphere(number)
-    parts = []
-    for i in range(0, len(points), _POINTS):
-        block, normal = points[i : i + _POINTS], normals[i : i + _POINTS]
-        rays = np.einsum("dj,nji->ndi", local, _frames(normal)).reshape(-1, 3)
-        seen = in_blocks(radiance_along, field, (np.repeat(block, number, 0), rays))
-        parts.append(jnp.pi * seen.reshape(len(block), number, -1).mean(1))
-    total = jnp.concatenate(parts) if parts else jnp.zeros((0, scene.bands))
-    total = total + in_blocks(_sun_irradiance, scene, (points, normals))
-    if emitters is not None and len(points):
-        total = total + emitter_irradiance(scene, emitters, points - _OFF * spacing * normals, normals).T
-    for light in scene.lights:
-        if isinstance(light, PointLight):
-            total = total + _point_light(scene, light, points, normals)
-    return _banded(scene, total)
+    points = _lift(solution.scene, points, normals)
+    return _banded(solution.scene, _gathered(solution, points, normals, number))
 
 
-def fluence(solution: Solution, points: Any) -> Float[Array, "n *bands"]:
-    """Fluence at points (n, 3) of the space that solids leave free, in W m^-2: interpolated, with the suns' exactly.
+def fluence(solution: Solution, points: Any, directions: int = 2048) -> Float[Array, "n *bands"]:
+    """Fluence at points (n, 3) of the space that solids leave free, in W m^-2, by a final gather.
+
+    4 pi times the mean of the radiance over `directions` directions, and the light of suns, point lights, small emitting
+    surfaces and compact volume sources exactly. With `directions=0` it is interpolated between the voxels instead: quick, for
+    many points.
 
     **Raises** `TypeError` for anything but a solution, `ValueError` for NaN, another shape, or points outside the lattice or
     inside a solid.
     """
     _check_solution(solution)
     points, scene = checks.points("points", points), solution.scene
+    number = checks.positive_int("directions", directions, at_least=0)
     if isinstance(points, np.ndarray):
         outside = ~np.asarray(scene.lattice.contains(points))
         if outside.any():
@@ -117,7 +106,56 @@ def fluence(solution: Solution, points: Any) -> Float[Array, "n *bands"]:
             advice = "there is no medium and no voxel there: leave it out"
             checks.fail(f"points[{at}]", points[at].tolist(), f"a point of the lattice, {_box(scene)}", advice)
     check_outside(scene, "points", points)
-    return _banded(scene, in_blocks(_fluence_at, light_field(solution), (points,)))
+    if number == 0:
+        return _banded(scene, in_blocks(_fluence_at, light_field(solution), (points,)))
+    margin = _OFF * scene.lattice.spacing
+    clip = np.clip if isinstance(points, np.ndarray) else jnp.clip
+    points = clip(points, scene.lattice.lower + margin, scene.lattice.upper - margin)
+    return _banded(scene, _gathered(solution, points, None, number))
+
+
+def _gathered(solution: Solution, points: Any, normals: Any, number: int) -> Float[Array, "n C"]:
+    """The light at some points: the mean over directions of what rays see, and what comes straight from small sources."""
+    scene, margin = solution.scene, _OFF * solution.scene.lattice.spacing
+    field = light_field(solution)
+    compact = compact_sources(scene, solution.elements, _BLOCKS)
+    if compact is not None:
+        rest = np.where(compact.emission > 0, 0.0, np.asarray(emission_of(scene)))
+        field = eqx.tree_at(lambda f: f.scene, field, with_emission(scene, rest))
+    emitters = small_emitters(scene, solution.elements) if not _has_images(scene) else None
+    far = np.zeros(len(points), bool) if emitters is None else ~emitters.near(points)
+    dark = eqx.tree_at(lambda f: f.emission, field, jnp.zeros_like(field.emission))
+    total = jnp.zeros((len(points), scene.bands))
+    pick = lambda chosen: None if normals is None else normals[chosen]
+    for chosen, seen in ((np.nonzero(~far)[0], field), (np.nonzero(far)[0], dark)):
+        if len(chosen):
+            total = total.at[chosen].set(_mean_of_rays(seen, points[chosen], pick(chosen), number))
+    if emitters is not None and far.any():
+        (chosen,) = np.nonzero(far)
+        on_surface = points[chosen] if normals is None else points[chosen] - margin * normals[chosen]
+        total = total.at[chosen].add(emitter_light(scene, emitters, on_surface, pick(chosen)).T)
+    if compact is not None:
+        total = total + volume_light(scene, compact, points, normals, rays=4 * number).T
+    for light in scene.lights:
+        if isinstance(light, PointLight):
+            total = total + _point_light(scene, light, points, normals)
+    suns = (points,) if normals is None else (points, normals)
+    return total + in_blocks(_sun_fluence if normals is None else _sun_irradiance, scene, suns)
+
+
+def _mean_of_rays(field: LightField, points: Any, normals: Any, number: int) -> Float[Array, "n C"]:
+    """4 pi times the mean of the radiance over the sphere; with normals pi times its mean, weighted by the cosine."""
+    parts = []
+    for i in range(0, len(points), _POINTS):
+        block = points[i : i + _POINTS]
+        if normals is None:
+            rays = np.tile(whole_sphere(number), (len(block), 1))
+        else:
+            rays = np.einsum("dj,nji->ndi", cosine_hemisphere(number), frames(normals[i : i + _POINTS])).reshape(-1, 3)
+        xp = np if isinstance(block, np.ndarray) else jnp
+        seen = in_blocks(radiance_along, field, (xp.repeat(block, number, 0), rays))
+        parts.append(seen.reshape(len(block), number, -1).mean(1))
+    return jnp.concatenate(parts) * (4 * jnp.pi if normals is None else jnp.pi)
 
 
 def outgoing_flux(solution: Solution, side: str) -> Float[Array, "nu nv *bands"]:
@@ -222,6 +260,10 @@ def _sun_irradiance(scene: Scene, points: Array, normals: Array) -> Float[Array,
     return _sun_light(scene, points, normals)
 
 
+def _sun_fluence(scene: Scene, points: Array) -> Float[Array, "n C"]:
+    return _sun_light(scene, points, None)
+
+
 def _sun_light(scene: Scene, points: Array, normals: Array | None) -> Float[Array, "n C"]:
     """Direct light of all suns at points off the surfaces: irradiance, or fluence without normals."""
     total = jnp.zeros((len(points), scene.bands), points.dtype)
@@ -262,13 +304,13 @@ def _sunlit(scene: Scene, points: Array, back: Array, towards: Array) -> Float[A
     return jnp.where(lit[:, None], passed, 0.0)
 
 
-def _point_light(scene: Scene, light: PointLight, points: np.ndarray, normals: np.ndarray) -> Float[Array, "n C"]:
-    """Irradiance I T V cos / r^2 from a point light."""
+def _point_light(scene: Scene, light: PointLight, points: Any, normals: Any) -> Float[Array, "n C"]:
+    """Irradiance I T V cos / r^2 from a point light; without normals fluence."""
     to = np.asarray(light.position) - points
     squared = np.maximum((to**2).sum(-1), 1e-30)
-    geometry = np.maximum((to * normals).sum(-1), 0.0) / squared**1.5
+    cosine = 1.0 if normals is None else np.maximum((to * normals).sum(-1), 0.0) / np.sqrt(squared)
     ends = np.broadcast_to(np.asarray(light.position), points.shape)
-    reach = visible(scene, points, ends) * transmittance(scene, points, ends) * jnp.asarray(geometry, float)
+    reach = visible(scene, points, ends) * transmittance(scene, points, ends) * jnp.asarray(cosine / squared, float)
     return reach.T * jnp.broadcast_to(light.intensity, (scene.bands,))
 
 
@@ -347,20 +389,3 @@ def _untraced(scene: Scene) -> Scene:
 
 def _box(scene: Scene) -> str:
     return f"{scene.lattice.lower.tolist()} to {scene.lattice.upper.tolist()}"
-
-
-def _hemisphere(number: int) -> np.ndarray:
-    """Directions around +z, (number, 3), whose density is cos / pi: a sunflower's seeds on the disc, lifted to the sphere."""
-    i = np.arange(number)
-    squared = (i + 0.5) / number
-    angle = i * np.pi * (3 - np.sqrt(5))
-    radius = np.sqrt(squared)
-    return np.stack([radius * np.cos(angle), radius * np.sin(angle), np.sqrt(1 - squared)], -1)
-
-
-def _frames(normals: np.ndarray) -> np.ndarray:
-    """Three rows for each normal: two unit vectors across it, and itself. (n, 3, 3)."""
-    helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
-    first = np.cross(helper, normals)
-    first /= np.linalg.norm(first, axis=1, keepdims=True)
-    return np.stack([first, np.cross(normals, first), normals], axis=1)

@@ -9,8 +9,8 @@ whatever iteration found it. Where T, R and s change,
     da = (I - T R)^-1 (d(T R) (s + a) + T R ds),        and backwards        l = a' + R'T' l,
 
 the second with the transposed sweep; l is then pulled back through one application of T R. Both are solved by restarted GMRES
-on u = v + A u. Known numbers are iterated on the host; while JAX traces (`jit`, `vmap`) the same steps make up a loop of the
-program, and a solve keeps no record of its sweeps.
+on u = v + A u. Known numbers are iterated on the host, with diffusion for a preconditioner (`acceleration`); while JAX traces
+(`jit`, `vmap`) plain steps make up a loop of the program, and a solve keeps no record of its sweeps.
 
 Public: `attach`, `Unwatched`.
 """
@@ -31,11 +31,15 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from . import checks
+from .acceleration import Diffusion
 from .adjoint import linear
 from .iteration import Certificate, System
+from .krylov import linear_solve, norm
 from .operator import Light, Materials, Transport
+from .solvers import Krylov
 
 _RESTART = 8
+_Residuals = tuple[Transport, Materials, Diffusion | None]
 _SHARE = 0.1  # of the solve's tolerance that residuals of derivatives may have, relative to what is solved for
 
 
@@ -45,11 +49,11 @@ class Unwatched:
     def __init__(self, system: System, rtol: float, most: int):
         self.system = system
         known = stop_gradient(system)
-        first = known.transport(known.materials.reflected(known.source), fluence=known.scatters)
-        self.arriving = _Solve(rtol, most, False)((known.transport, known.materials), first)
-        self.bound = self.target = math.nan
-        self.residuals, self.sweeps, self.certificate = [], 0, Certificate(math.nan, 0)
-        self.converged = self.stagnated = False
+        first = known.bounce(known.materials.reflected(known.source))[0]
+        self.arriving = _Solve(rtol, most, False)((known.transport, known.materials, None), first)
+        self.bound = self.target = self.rounding = math.nan
+        self.residuals, self.sweeps, self.certificate = [math.nan], 0, Certificate(math.nan, 0)
+        self.ending, self.solver = "", Krylov(_RESTART, diffusion=False)
 
 
 def stop_gradient(tree: Any) -> Any:
@@ -79,10 +83,10 @@ def attach(system: System, arriving: Light, rtol: float, most: int) -> Light:
             for i, v in zip(active, values, strict=True):
                 full[i] = v
             moved: System = tree.unflatten(full)
-            return moved.transport(moved.materials.reflected(moved.source + arriving), fluence=moved.scatters)
+            return moved.bounce(moved.materials.reflected(moved.source + arriving))[0]
 
         change = jax.jvp(bounce, [leaves[i] for i in active], [moves[i] for i in active])[1]
-        return arriving, _solved(rtol, most, False, (system.transport, system.materials), change)
+        return arriving, _solved(rtol, most, False, (system.transport, system.materials, system.near), change)
 
     fixed.defjvp(rule, symbolic_zeros=True)
     return fixed(system, stop_gradient(arriving))
@@ -102,10 +106,16 @@ class _Solve:
     most: int
     transposed: bool
 
-    def __call__(self, residuals: tuple[Transport, Materials], operand: Light) -> Light:
+    def __call__(self, residuals: _Residuals, operand: Light) -> Light:
         apply = lambda u: _apply(self.transposed, residuals, u)
         tolerance = max(_SHARE * self.rtol, 16 * float(jnp.finfo(operand.elements.dtype).eps))
-        return _gmres(apply, operand, tolerance, self.most, traced=checks.is_traced((residuals, operand)))
+        if checks.is_traced((residuals, operand)):
+            return _gmres(apply, operand, tolerance, self.most)
+        near = residuals[2]
+        precondition = (lambda u: u) if near is None else near.of_arriving_transposed if self.transposed else near.of_arriving
+        target = tolerance * float(norm(operand))
+        good = lambda residual: float(norm(residual)) <= target
+        return linear_solve(apply, operand, precondition, good, self.most)[0]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,14 +131,14 @@ class _Change:
         return _solved(self.rtol, self.most, self.transposed, residuals, change)
 
 
-def _apply(transposed: bool, residuals: tuple[Transport, Materials], light: Light) -> Light:
-    transport, stuff = residuals
+def _apply(transposed: bool, residuals: _Residuals, light: Light) -> Light:
+    transport, stuff, _ = residuals
     if transposed:
-        return stuff.reflected(transport.transposed(light))
-    return transport(stuff.reflected(light), fluence=stuff.extinction is not None)
+        return stuff.reflected(transport.transposed(light, scattered=True))
+    return transport(stuff.reflected(light), fluence=stuff.extinction is not None, scattered=True)
 
 
-# GMRES (see `iteration`), in steps that run on the host or in a loop of a program
+# GMRES (see `krylov`) as a loop of a program
 
 
 class _State(NamedTuple):
@@ -141,16 +151,12 @@ class _State(NamedTuple):
     count: Int[Array, ""]
 
 
-def _gmres(apply: Callable[[Light], Light], right: Light, tolerance: float, most: int, traced: bool) -> Light:
+def _gmres(apply: Callable[[Light], Light], right: Light, tolerance: float, most: int) -> Light:
     """u with |right + A u - u| <= tolerance |right|, Euclidean."""
     state, scale, target = _begin(right, tolerance)
     last = lambda state: jax.tree.map(lambda b: lax.dynamic_index_in_dim(b, state.step, 0, keepdims=False), state.basis)
     going = lambda state: (state.left > target) & (state.count < most)
-    if traced:
-        state = lax.while_loop(going, lambda state: _advance(state, apply(last(state)), target), state)
-    else:
-        while bool(going(state)):
-            state = _advance(state, apply(last(state)), target)
+    state = lax.while_loop(going, lambda state: _advance(state, apply(last(state)), target), state)
     return jax.tree.map(lambda x: x * scale, state.solution)
 
 

@@ -4,15 +4,14 @@ K has no negative entries and x* >= 0. For any w > 0 with w - K w > 0, and any x
 
     |x* - x| <= max |r| * F,    F = max w / min(w - K w),
 
-and after one more step x' = b + K x the same with K's largest row sum as a further factor. w = 1 serves while every row of K
-adds up to less than 1; else w = 1 + K 1 + K^2 1 + ..., until every path of light has had a chance to end. The last change is
-no such bound: at albedo 0.99 it can be 100 times smaller than the error.
+and after one more step x' = b + K x the same with F - 1 for F, because (I - K)^-1 K = (I - K)^-1 - I. w = 1 serves while every
+row of K adds up to less than 1; better is a solution of (I - K) w = 1, which need not be exact. The last change is no such
+bound: at albedo 0.99 it can be 100 times smaller than the error.
 
-- `Jacobi` adds up orders of bounced light: the k-th iterate holds light of up to k bounces (Langer et al. 1995, eq. 1).
-- `Krylov` takes the combination of the last few orders that leaves the smallest residual (GMRES: Saad & Schultz, SIAM J. Sci.
-  Stat. Comput. 7, 1986), restarted. Each sweep serves it at least as well as it serves Jacobi.
+GMRES leaves residuals of either sign, large in few places, of which max |r| F makes far too much. One sweep more for any u says
+better: if |r| <= u - K u + t (w - K w), then |x* - x| <= u + t w; here u is what diffusion makes of |r|.
 
-Public: `System`, `Certificate`, `Iteration`, `certify`, `Jacobi`, `Krylov`.
+Public: `System`, `Certificate`, `Iteration`, `certify`.
 """
 
 from __future__ import annotations
@@ -24,24 +23,32 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
+from .acceleration import Diffusion
 from .checkpoint import Checkpoint
 from .direct import Direct
+from .krylov import linear_solve
 from .operator import Light, Materials, Transport
 from .progress import Progress
 
+_PLAIN = 0.9  # up to this albedo w = 1 will do
 _CERTAIN = 0.98  # a largest row sum of K above this asks for a better w
 _POWERS = 48  # terms of w tried at most
+_ENOUGH = 0.5  # w - K w of at least this ends the search for w
+_SEARCH = 24  # sweeps of it at most
 _STALLED = 24  # sweeps without a new smallest residual before giving up
+_GROWN = 1e3  # times the first residual: diverged
+_HOPED = 0.05  # what polishing is at first taken to make of a bound
+_ROUNDING = 2.0  # units in the last place by which a sweep's result may be off, of the largest radiance
 
 
 class System(eqx.Module):
-    """x = K x + b: the transport, the materials, and the first-flight light."""
+    """x = K x + b: the transport, the materials, the first-flight light, and what makes a solver fast."""
 
     transport: Transport
     materials: Materials
     direct: Direct
+    near: Diffusion | None = None
 
     @property
     def source(self) -> Light:
@@ -54,8 +61,12 @@ class System(eqx.Module):
 
     def bounce(self, leaving: Light) -> tuple[Light, Light]:
         """The light that arrives, of what leaves; and what of it leaves again."""
-        arriving = self.transport(leaving, fluence=self.scatters)
+        arriving = self.transport(leaving, fluence=self.scatters, scattered=True)
         return arriving, _reflected(self.materials, arriving)
+
+    def precondition(self, leaving: Light) -> Light:
+        """About the solution of (I - K) x = leaving, without a sweep."""
+        return leaving if self.near is None else self.near(leaving)
 
     def nothing(self) -> Light:
         """No arriving light."""
@@ -65,24 +76,78 @@ class System(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class Certificate:
-    """The error after a step is at most `factor` times the largest residual before it; `sweeps` were spent to know."""
+    """The error after a step is at most `factor` times the largest residual before it; `sweeps` were spent to know.
+
+    `factor` is inf, and `reason` says why, where no bound was found. `weights` and `slack`: w and w - K w.
+    """
 
     factor: float
     sweeps: int
+    reason: str = ""
+    weights: Light | None = None
+    slack: Light | None = None
 
 
 def certify(system: System) -> Certificate:
-    """Find w by applying K to 1 until what is left everywhere is surely less than 1."""
-    total = jax.tree.map(jnp.ones_like, system.materials.reflected(system.source))
+    """Find a w: 1 where albedos are moderate, else by solving (I - K) w = 1 to within a half."""
+    albedo = system.materials.reflected(jax.tree.map(jnp.ones_like, system.source))
+    largest = float(albedo.largest())
+    if largest == 0:
+        return Certificate(0.0, 0)
+    if system.near is None or largest <= _PLAIN:
+        return _by_powers(system, albedo)
+    # Where nothing is reflected x is exact, and w may be 0.
+    ones = jax.tree.map(lambda a: jnp.where(a > 0, 1.0, 0.0).astype(a.dtype), albedo)
+    shortfall = lambda residual: float(_most_positive(residual))
+    apply = lambda light: system.bounce(light)[1]
+    w, residual, count = linear_solve(apply, ones, system.precondition, lambda r: shortfall(r) <= 1 - _ENOUGH, _SEARCH)
+    least = 1 - shortfall(residual)  # of w - K w
+    from_rows = largest / (1 - largest) if largest < 1 else math.inf
+    # From w - K w > 0 follows w > 0, but for rounding.
+    factor = float(w.largest()) / least - 1 if least > 0.01 else math.inf
+    # What the float type cannot tell from light that bounces without loss.
+    lossless = 0.1 / (_ROUNDING * float(jnp.finfo(w.elements.dtype).eps))
+    if factor <= min(from_rows, lossless):
+        return Certificate(factor, count, "", w, jax.tree.map(jnp.subtract, ones, residual))
+    if from_rows <= lossless:
+        return Certificate(from_rows, count, "", ones, jax.tree.map(lambda one, a: one * (1 - a), ones, albedo))
+    return Certificate(
+        math.inf, count, f"as far as {w.elements.dtype} can tell in {count} sweeps, some light bounces without loss"
+    )
+
+
+@eqx.filter_jit
+def _most_positive(light: Light):
+    return jnp.stack([jnp.max(part, initial=0.0) for part in jax.tree.leaves(light)]).max()
+
+
+def _by_powers(system: System, total: Light) -> Certificate:
+    """w = 1 + K 1 + K^2 1 + ..., until every path of light has had a chance to end; one sweep where albedos are moderate."""
+    ones = total = jax.tree.map(lambda a: jnp.where(a > 0, 1.0, 0.0).astype(a.dtype), total)
     power = system.bounce(total)[1]
-    row_sum = min(float(power.largest()), 1.0)
     count = 1
-    # Where rows add up to well below 1 this loop does nothing.
     while float(power.largest()) > _CERTAIN and count < _POWERS:
         total = total + power
         power, count = system.bounce(power)[1], count + 1
     left = float(power.largest())
-    return Certificate(row_sum * float(total.largest()) / (1 - left) if left < 1 - 1e-6 else math.inf, count)
+    if left >= 1 - 1e-6:
+        return Certificate(math.inf, count, f"some light bounces {count} times without loss")
+    slack = jax.tree.map(jnp.subtract, ones, power)
+    return Certificate(float(total.largest()) / (1 - left) - 1, count, "", total, slack)
+
+
+@eqx.filter_jit
+def _bounded(weights: Light, slack: Light, residual: Light, u: Light, passed: Light):
+    """The largest of a u + t w - |r|, with t as the module's docstring says, and a as serves best; `passed` is K u."""
+    size = jax.tree.map(jnp.abs, residual)
+    missing = lambda r, covered, d: jnp.max(jnp.where(d > 0, (r - covered) / jnp.where(d > 0, d, 1.0), 0.0), initial=0.0)
+
+    def bound(a):
+        covered = jax.tree.map(lambda u, k: a * (u - k), u, passed)
+        t = jnp.stack(jax.tree.leaves(jax.tree.map(missing, size, covered, slack))).max()
+        return _most_positive(jax.tree.map(lambda r, u, w: a * u + t * w - r, size, u, weights))
+
+    return jnp.min(jax.lax.map(bound, jnp.linspace(0.0, 2.0, 21, dtype=residual.elements.dtype)))
 
 
 @eqx.filter_jit
@@ -105,6 +170,10 @@ class Iteration:
         self._rtol, self._most, self._meter = rtol, most, meter
         self.lost = self.arriving  # the low bits of Jacobi's sum
         self.checkpoint: Checkpoint | None = None
+        self.stuck = False  # a solver's own word that it cannot go on
+        self._more = 0  # sweeps that led to no iterate
+        self._tight = math.inf  # a bound on the present iterate's error, better than the factor's
+        self._gain = _HOPED  # of polishing, on the bound
 
     def _state(self) -> tuple:
         return self.arriving, self.residual, self.lost, np.array(self.residuals), np.array(self.target)
@@ -125,133 +194,95 @@ class Iteration:
 
     @property
     def bound(self) -> float:
-        return self.certificate.factor * self.residuals[-1] if self.residuals[-1] > 0 else 0.0
+        return min(self.certificate.factor * self.residuals[-1], self._tight) if self.residuals[-1] > 0 else 0.0
 
     @property
-    def sweeps(self) -> int:
-        return len(self.residuals) - 1
+    def close(self) -> bool:
+        """Whether it is time to polish: not before, because that interrupts a solver."""
+        known = self.system.near is not None and self.certificate.weights is not None and self.sweeps_left >= 2
+        return known and not self.converged and self.bound * self._gain <= self.target
+
+    def polish(self) -> None:
+        """Two sweeps: one order of bounces more, which smooths the residual, and a closer look at what is left.
+
+        If the bound does not meet the target then, everything stays as it was, for the solver to go on.
+        """
+        weights, slack, begun = self.certificate.weights, self.certificate.slack, (self.arriving, self.residual)
+        assert weights is not None and slack is not None
+        before = self.bound
+        order, residual = self.system.bounce(self.residual)
+        self.reach(self.arriving + order, residual)
+        if self.over:
+            return
+        u = self.system.precondition(jax.tree.map(jnp.abs, residual))
+        tight = float(_bounded(weights, slack, residual, u, self.system.bounce(u)[1]))
+        self.spend(1)
+        self._tight = tight if math.isfinite(tight) else math.inf
+        self._meter.update(self.sweeps, math.pi * self.bound, math.pi * self.target)
+        if not self.converged:
+            # Not again before it can be expected to do.
+            self._gain = min(1.5 * self.bound / before, 0.5)
+            self.arriving, self.residual = begun
+            self._tight = math.inf
+            self.residuals.pop()
+            self.spend(1)
+
+    @property
+    def rounding(self) -> float:
+        """What the float type's rounding in the sweeps may add to the error, by the same bound."""
+        eps = float(jnp.finfo(self.residual.elements.dtype).eps)
+        largest = self.target / self._rtol
+        return _ROUNDING * eps * (1 + self.certificate.factor) * largest if largest > 0 else 0.0
 
     @property
     def converged(self) -> bool:
         return self.bound <= self.target
 
     @property
-    def stagnated(self) -> bool:
-        """No new smallest residual for a while."""
-        return self.sweeps >= _STALLED and min(self.residuals[-_STALLED:]) >= min(self.residuals[:-_STALLED])
+    def sweeps(self) -> int:
+        return len(self.residuals) - 1 + self._more
+
+    @property
+    def sweeps_left(self) -> int:
+        return self._most - self.sweeps
+
+    def spend(self, sweeps: int) -> None:
+        """Count sweeps that a solver made without telling what they led to."""
+        self._more += sweeps
+
+    @property
+    def ending(self) -> str:
+        """How it stands: "" (go on), "converged", "no bound", "diverged", "stagnated" or "sweep limit"."""
+        if self.converged:
+            return "converged"
+        if not self.residuals[-1] <= _GROWN * self.residuals[0]:
+            return "diverged"
+        # Without a bound the residual alone must do: as small as for a factor of 1000.
+        if not math.isfinite(self.bound) and self.residuals[-1] <= 1e-3 * self.target:
+            return "no bound"
+        if self.stuck:
+            return "stagnated"
+        if len(self.residuals) > _STALLED and min(self.residuals[-_STALLED:]) >= min(self.residuals[:-_STALLED]):
+            return "stagnated"
+        return "sweep limit" if self.sweeps >= self._most else ""
 
     @property
     def over(self) -> bool:
-        return self.converged or self.stagnated or self.sweeps >= self._most
+        return self.ending != ""
 
     def note(self, residual: float, largest: float) -> None:
         """One sweep more, and what it led to: the largest residual, and the largest of all that leaves."""
         self.residuals.append(residual)
+        self._tight = math.inf
         self.target = self._rtol * max(self._scale, largest)
         self._meter.update(self.sweeps, math.pi * self.bound, math.pi * self.target)
 
-
-class Jacobi(eqx.Module):
-    """The paper's iteration: one sweep a bounce. Converges where light is lost; quickly where albedos are below 0.9.
-
-    Each sweep carries the last order of bounces alone, so rounding errors shrink with the orders.
-    """
-
-    def run(self, iteration: Iteration) -> None:
-        while not iteration.over:
-            order, iteration.residual = iteration.system.bounce(iteration.residual)
-            iteration.arriving, iteration.lost = _add(iteration.arriving, iteration.lost, order)
-            iteration.note(float(iteration.residual.largest()), float(_largest(iteration.system, iteration.arriving)))
-            iteration.keep()
+    def reach(self, arriving: Light, residual: Light) -> None:
+        """One sweep more, and where it led to."""
+        self.arriving, self.residual = arriving, residual
+        self.note(float(residual.largest()), float(_largest(self.system, arriving)))
 
 
 @eqx.filter_jit
-def _add(total: Light, lost: Light, order: Light) -> tuple[Light, Light]:
-    """Kahan's sum: `lost` holds the low bits."""
-    addend = jax.tree.map(jnp.subtract, order, lost)
-    after = total + addend
-    return after, jax.tree.map(lambda new, old, a: (new - old) - a, after, total, addend)
-
-
-class Krylov(eqx.Module):
-    """GMRES on (I - K) x = b, restarted: half of Jacobi's sweeps or fewer, 2 `restart` + 1 fields more."""
-
-    restart: int = eqx.field(static=True, default=8)
-
-    def run(self, iteration: Iteration) -> None:
-        while not iteration.over:
-            self._cycle(iteration)
-            iteration.keep()
-
-    def _cycle(self, iteration: Iteration) -> None:
-        system, start, begun = iteration.system, iteration.residual, iteration.arriving
-        length = float(_norm(start))
-        empty = jax.tree.map(jnp.zeros_like, start)
-        none = system.nothing()
-        basis = [_combine([1 / length], [start])] + [empty] * self.restart
-        orders = [none] * self.restart
-        hessenberg = np.zeros((self.restart + 1, self.restart))
-        for step in range(self.restart):
-            orders[step], leaving = system.bounce(basis[step])
-            basis[step + 1], column = _arnoldi(tuple(basis), basis[step], leaving)
-            hessenberg[:, step] = np.asarray(column)[: self.restart + 1]
-            hessenberg[step + 1, step] = float(column[-1])
-            small = hessenberg[: step + 2, : step + 1]
-            right = np.zeros(step + 2)
-            right[0] = length
-            weights = np.linalg.lstsq(small, right, rcond=None)[0]
-            left = np.zeros(self.restart + 1)
-            left[: step + 2] = right - small @ weights
-            chosen = np.zeros(self.restart)
-            chosen[: step + 1] = weights
-            residual = _combine(left, basis)
-            arriving = begun + _combine(chosen, orders)
-            iteration.arriving, iteration.residual = arriving, residual
-            iteration.note(float(residual.largest()), float(_largest(system, arriving)))
-            if iteration.over or hessenberg[step + 1, step] <= 1e-6 * length:
-                return
-
-
-@eqx.filter_jit
-def _arnoldi(basis: tuple[Light, ...], last: Light, leaving: Light) -> tuple[Light, Array]:
-    """The next basis vector: (I - K) last, made orthogonal to the basis; `leaving` is K last. Unused vectors are 0."""
-    vector = jax.tree.map(jnp.subtract, last, leaving)
-    column = jnp.zeros(len(basis), last.elements.dtype)
-    for _ in range(2):  # twice is enough, in float32 too
-        overlap = jnp.stack([_dot(b, vector) for b in basis])
-        for k, b in enumerate(basis):
-            vector = jax.tree.map(lambda v, x, k=k, overlap=overlap: v - overlap[k] * x, vector, b)
-        column = column + overlap
-    length = jnp.sqrt(_dot(vector, vector))
-    scale = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)
-    return jax.tree.map(lambda v: v * scale, vector), jnp.append(column, length)
-
-
-def _dot(a: Light, b: Light) -> Array:
-    return sum(jax.tree.leaves(jax.tree.map(lambda x, y: jnp.sum(x * y), a, b)), start=jnp.zeros((), a.elements.dtype))
-
-
-@eqx.filter_jit
-def _norm(light: Light) -> Array:
-    # Scaled, so that squares neither overflow nor vanish.
-    scale = jnp.maximum(light.largest(), jnp.finfo(light.elements.dtype).tiny)
-    scaled = jax.tree.map(lambda x: x / scale, light)
-    return scale * jnp.sqrt(_dot(scaled, scaled))
-
-
-@eqx.filter_jit
-def _sum(weights: tuple[Array, ...], fields: tuple[Light, ...]) -> Light:
-    total = jax.tree.map(lambda x: weights[0] * x, fields[0])
-    for weight, field in zip(weights[1:], fields[1:], strict=True):
-        total = jax.tree.map(lambda t, x, weight=weight: t + weight * x, total, field)
-    return total
-
-
-def _combine(weights, fields: list[Light]) -> Light:
-    real = fields[0].elements.dtype
-    return _sum(tuple(jnp.asarray(w, real) for w in weights), tuple(fields))
-
-
-@eqx.filter_jit
-def _largest(system: System, arriving: Light) -> Array:
+def _largest(system: System, arriving: Light):
     return system.materials.reflected(system.source + arriving).largest()

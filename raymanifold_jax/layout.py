@@ -63,6 +63,7 @@ class Reads(eqx.Module):
     cell: Int[Array, " M"]  # voxel read, flat in its plane
     element: Int[Array, " M"]
     plane: tuple[Float[Array, " M"], ...]  # the element's plane: offset, then the normal along (axis, u, v); padding: 0
+    height: Float[Array, " M"]  # of the read voxel's centre above the element's plane, in voxels
     home: Int[Array, "2 M"]  # the element's own voxel: its plane and its place in the plane
     first_tile: Int[Array, " K1"]
     tile: int = eqx.field(static=True)
@@ -150,10 +151,11 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
         constant_values=True,
     )
     periodic = [p == 0 for p in pad]
+    away = probe - voxel
     probe = np.where(periodic, probe % padded, np.clip(probe, 0, np.array(padded) - 1))
     probing = ~blocked[tuple(probe.T)]
-    rows = {"voxel": voxel, "element": element, "offset": offset, "normal": normal}
-    probes = {key: value[probing] for key, value in rows.items()}
+    rows = {"voxel": voxel, "element": element, "offset": offset, "normal": normal, "away": np.zeros_like(away)}
+    probes = {key: value[probing] for key, value in (rows | {"away": away}).items()}
     real = np.dtype(jnp.zeros(0).dtype)
     return Layout(
         unfolding=unfolding,
@@ -247,6 +249,7 @@ def _axis_reads(
         cell=spread(flat(voxel), np.int32),
         element=spread(rows["element"], np.int32),
         plane=tuple(spread(values, real) for values in (rows["offset"], *rows["normal"].T[[axis, u, v]])),
+        height=spread(rows["offset"] + np.einsum("mi,mi->m", rows["normal"], rows["away"]), real),
         home=spread(np.column_stack([rows["voxel"][:, axis], flat(rows["voxel"])]), np.int32),
         first_tile=jnp.asarray(first_tile, np.int32),
         tile=tile,

@@ -5,7 +5,7 @@ With extinction s, scattering z, emission e and fluence phi, a segment of length
     L' = L exp(-s l) + (z phi / 4 pi + e) l (1 - exp(-s l)) / (s l)                    (s = 0 is allowed)
 
 Where a coefficient differs between voxels a segment ends at every voxel's faces, and each voxel's own values hold;
-else segments are equal and at most a voxel's side long. The fluence is that at a segment's middle, interpolated.
+else segments are equal and at most a voxel's side long. The fluence is interpolated, at the centre of what a segment sends.
 
 Public: `transmittance`, `march`, `fill`, `interpolate`; for blocks of rays `transmittance_between`, `march_between`.
 """
@@ -81,26 +81,38 @@ def _three(values: Array, axis: int) -> Array:
 
 
 def interpolate(scene: Scene, filled: Float[Array, "C nx ny nz"], u: Float[Array, "n 3"]) -> Float[Array, "n C"]:
-    """Trilinear interpolation of a field without gaps, at unfolded voxel coordinates; level within half a voxel of a side."""
-    return _interpolate(unfolded_axes(scene), filled.reshape(filled.shape[0], -1), tuple(u.T)).T
+    """Trilinear interpolation of a field without gaps, at unfolded voxel coordinates; straight on to the sides."""
+    return _interpolate(unfolded_axes(scene), _rimmed(filled), tuple(u.T)).T
 
 
-def _interpolate(axes: tuple[Axis, ...], flat: Array, u: tuple[Array, ...]) -> Array:
-    total = jnp.zeros((flat.shape[0], *u[0].shape), flat.dtype)
+def _rimmed(field: Float[Array, "C nx ny nz"]) -> Float[Array, "C V"]:
+    """A field with a layer of voxels around it that goes on in a straight line, though not past 0 or twice as much; flat."""
+    for axis in (1, 2, 3):
+        n = field.shape[axis]
+        at = lambda i, field=field, axis=axis: lax.slice_in_dim(field, i, i + 1, axis=axis)
+        beyond = lambda i, j, at=at: jnp.clip(2 * at(i) - at(j), 0.0, 2 * jnp.maximum(at(i), 0.0))
+        inner = min(1, n - 1)
+        field = jnp.concatenate([beyond(0, inner), field, beyond(n - 1, n - 1 - inner)], axis)
+    return field.reshape(field.shape[0], -1)
+
+
+def _interpolate(axes: tuple[Axis, ...], rimmed: Array, u: tuple[Array, ...]) -> Array:
+    """`rimmed` is what `_rimmed` makes of a field."""
+    total = jnp.zeros((rimmed.shape[0], *u[0].shape), rimmed.dtype)
     for weight, voxel in _corners(axes, u):
-        total = total + weight * flat.at[:, voxel].get(mode="promise_in_bounds")
+        total = total + weight * rimmed.at[:, voxel].get(mode="promise_in_bounds")
     return total
 
 
 def _corners(axes: tuple[Axis, ...], u: tuple[Array, ...]) -> Iterator[tuple[Array, Array]]:
-    """The eight voxels around points, with their weights."""
+    """The eight voxels of a rimmed field around points, with their weights."""
     corners = []
     for axis, x in zip(axes, u, strict=True):
         floor = jnp.floor(x - 0.5)
         after = x - 0.5 - floor
         index = floor.astype(jnp.int32)
-        corners.append(((1 - after, axis.fold_index(index)), (after, axis.fold_index(index + 1))))
-    ny, nz = axes[1].count, axes[2].count
+        corners.append(((1 - after, axis.fold_index(index, 1) + 1), (after, axis.fold_index(index + 1, 1) + 1)))
+    ny, nz = axes[1].count + 2, axes[2].count + 2
     for a, i in corners[0]:
         for b, j in corners[1]:
             for c, k in corners[2]:
@@ -118,6 +130,13 @@ def _share(depth: Array) -> Array:
     small = depth < 1e-3
     safe = jnp.where(small, 1.0, depth)
     return jnp.where(small, 1 - depth / 2 + depth**2 / 6, -jnp.expm1(-safe) / safe)
+
+
+def _center(depth: Array) -> Array:
+    """Where in a segment of this optical depth, as a share of it, lies the centre of what reaches its near end."""
+    small = depth < 0.1
+    safe = jnp.where(small, 1.0, depth)
+    return jnp.where(small, 0.5 - depth / 12 + depth**3 / 720, 1 / safe - 1 / jnp.expm1(jnp.minimum(safe, 80.0)))
 
 
 def _transmittance(scene: Scene, start: Array, end: Array) -> Array:
@@ -144,14 +163,16 @@ def transmittance_between(scene: Scene, o: Array, w: Array, start: Array, stop: 
     return jnp.broadcast_to(jnp.exp(-depth), (scene.bands, len(o))).T
 
 
-def march_between(context: tuple[Scene, Array], origins: Array, directions: Array, start: Array, stop: Array):
-    """`march` for one block, from fluence without gaps."""
+def march_between(
+    context: tuple[Scene, Array | None], origins: Array, directions: Array, start: Array, stop: Array
+) -> tuple[Float[Array, "n C"], Float[Array, "n C"]]:
+    """`march` for one block, from fluence without gaps; None: nothing is scattered."""
     scene, filled = context
     shape = (scene.bands, len(origins))
     if scene.medium is None:
         return jnp.zeros(shape, origins.dtype).T, jnp.ones(shape, origins.dtype).T
     axes, spacing = unfolded_axes(scene), scene.lattice.spacing
-    flat = filled.reshape(filled.shape[0], -1).astype(origins.dtype)
+    rimmed = None if filled is None else _rimmed(filled).astype(origins.dtype)
     # From the near end on, so that a far eye costs no precision.
     start, stop = (jnp.where(jnp.isfinite(t), t, 0.0) for t in (start, stop))
     w = sloped(directions)
@@ -160,7 +181,7 @@ def march_between(context: tuple[Scene, Array], origins: Array, directions: Arra
     coefficients = tuple(c * spacing for c in _coefficients(scene))
     uniform = all(c.shape[1] == 1 for c in coefficients)
     how = _March(axes, scene.bands, uniform), _MarchAdjoint(axes, scene.bands, uniform)
-    radiance, depth = with_adjoint(*how)(coefficients, flat, o, w, length)
+    radiance, depth = with_adjoint(*how)(coefficients, rimmed, o, w, length)
     return radiance.T, jnp.exp(-depth).T
 
 
@@ -171,7 +192,7 @@ class _Depth:
     axes: tuple[Axis, ...]
 
     def __call__(self, extinction: Array, o: Array, w: Array, start: Array, stop: Array) -> Array:
-        add = lambda depth, middle, voxel, length: depth + _at(extinction, voxel) * length
+        add = lambda depth, point, voxel, length: depth + _at(extinction, voxel) * length
         return _walk(self.axes, o, w, start, stop, add, jnp.zeros((len(extinction), len(o)), o.dtype))
 
 
@@ -181,7 +202,7 @@ class _DepthAdjoint:
 
     def __call__(self, arguments, wanted, weights: Array):
         extinction, o, w, start, stop = arguments
-        add = lambda total, middle, voxel, length: total.at[:, voxel].add(weights * length)
+        add = lambda total, point, voxel, length: total.at[:, voxel].add(weights * length)
         return _walk(self.axes, o, w, start, stop, add, jnp.zeros_like(extinction)), None, None, None, None
 
 
@@ -193,10 +214,12 @@ class _March:
     bands: int
     uniform: bool
 
-    def __call__(self, coefficients: tuple[Array, ...], flat: Array, o: Array, w: Array, length: Array):
-        def add(state, middle, voxel, step):
+    def __call__(self, coefficients: tuple[Array, ...], rimmed: Array | None, o: Array, w: Array, length: Array):
+        def add(state, point, voxel, step):
             radiance, depth = state
-            added, own = _added(tuple(_at(c, voxel) for c in coefficients), _interpolate(self.axes, flat, middle), depth, step)
+            values = tuple(_at(c, voxel) for c in coefficients)
+            fluence = None if rimmed is None else _interpolate(self.axes, rimmed, _seen_from(values, point, step))
+            added, own = _added(values, fluence, depth, step)
             return radiance + added, depth + own
 
         nothing = jnp.zeros((self.bands, len(o)), o.dtype)
@@ -206,10 +229,17 @@ class _March:
         return (_stride if self.uniform else _walk)(self.axes, o, w, jnp.zeros_like(length), length, add, state)
 
 
-def _added(coefficients: tuple[Array, ...], fluence: Array, depth: Array, step: Array) -> tuple[Array, Array]:
+def _seen_from(coefficients: tuple[Array, ...], point: Callable, step: Array) -> tuple[Array, ...]:
+    """The centre of what a segment sends."""
+    scattering, absorption, _ = coefficients
+    return point(step * _center(((scattering + absorption) * step).mean(0)))
+
+
+def _added(coefficients: tuple[Array, ...], fluence: Array | None, depth: Array, step: Array) -> tuple[Array, Array]:
     """The radiance that one segment sends through the depth before it, and its own depth."""
-    scattering, absorption, emission = coefficients
-    source = scattering / (4 * jnp.pi) * fluence + emission
+    scattering, absorption, source = coefficients
+    if fluence is not None:
+        source = source + scattering / (4 * jnp.pi) * fluence
     own = (scattering + absorption) * step
     return jnp.exp(-depth) * source * step * _share(own), jnp.broadcast_to(own, depth.shape)
 
@@ -223,24 +253,35 @@ class _MarchAdjoint:
     uniform: bool
 
     def __call__(self, arguments, wanted, weights: tuple[Array, Array]):
-        coefficients, flat, o, w, length = arguments
+        coefficients, rimmed, o, w, length = arguments
         march = _March(self.axes, self.bands, self.uniform)
         total, _ = march(*arguments)
 
-        def add(state, middle, voxel, step):
+        def add(state, point, voxel, step):
             radiance, depth, sums, spread = state
-            fluence = _interpolate(self.axes, flat, middle)
-            one = lambda values, fluence: _added(values, fluence, depth, step)
-            (added, own), back = jax.vjp(one, tuple(_at(c, voxel) for c in coefficients), fluence)
+            values = tuple(_at(c, voxel) for c in coefficients)
+            corners = lambda values: [*_corners(self.axes, _seen_from(values, point, step))]
+            places, around = [], []
+            if rimmed is not None:
+                places = [place for _, place in corners(values)]
+                around = [rimmed.at[:, place].get(mode="promise_in_bounds") for place in places]
+
+            def one(values, around):
+                fluence = None
+                if around:
+                    fluence = sum((w * f for (w, _), f in zip(corners(values), around, strict=True)), start=jnp.zeros(()))
+                return _added(values, fluence, depth, step)
+
+            (added, own), back = jax.vjp(one, values, around)
             radiance = radiance + added
-            to_values, to_fluence = back((weights[0], weights[1] - (total - radiance) * weights[0]))
+            to_values, to_around = back((weights[0], weights[1] - (total - radiance) * weights[0]))
             sums = tuple(_put(s, voxel, v) for s, v in zip(sums, to_values, strict=True))
-            for weight, corner in _corners(self.axes, middle):
-                spread = spread.at[:, corner].add(weight * to_fluence)
+            for place, value in zip(places, to_around, strict=True):
+                spread = spread.at[:, place].add(value)
             return radiance, depth + own, sums, spread
 
         nothing = jnp.zeros((self.bands, len(o)), o.dtype)
-        state = (nothing, nothing, jax.tree.map(jnp.zeros_like, coefficients), jnp.zeros_like(flat))
+        state = (nothing, nothing, *jax.tree.map(jnp.zeros_like, (coefficients, rimmed)))
         _, _, sums, spread = march.advance(o, w, length, add, state)
         return sums, spread, None, None, None
 
@@ -259,7 +300,7 @@ def _at(coefficient: Array, voxel: Array | None) -> Array:
 
 
 def _walk(axes: tuple[Axis, ...], o: Array, w: Array, start: Array, stop: Array, add: Callable, state: Any) -> Any:
-    """state = add(state, middle, voxel, length) for every voxel that rays cross between two distances."""
+    """state = add(state, point, voxel, length) for every voxel that rays cross between two distances; point(distance in it)."""
     (ny, nz), xs, ws = (axes[1].count, axes[2].count), tuple(o.T), tuple(w.T)
     index = tuple(jnp.floor(x + start * v).astype(jnp.int32) for x, v in zip(xs, ws, strict=True))
 
@@ -269,9 +310,9 @@ def _walk(axes: tuple[Axis, ...], o: Array, w: Array, start: Array, stop: Array,
         planes = [(i + (v > 0) - x) / v for i, x, v in zip(index, xs, ws, strict=True)]
         crossing = jnp.minimum(jnp.minimum(planes[0], planes[1]), planes[2])
         after = jnp.clip(crossing, t, jnp.maximum(stop, t))
-        middle = tuple(x + 0.5 * (t + after) * v for x, v in zip(xs, ws, strict=True))
+        point = lambda s: tuple(x + (t + s) * v for x, v in zip(xs, ws, strict=True))
         i, j, k = (axis.fold_index(n) for axis, n in zip(axes, index, strict=True))
-        state = add(state, middle, (i * ny + j) * nz + k, after - t)
+        state = add(state, point, (i * ny + j) * nz + k, after - t)
         going = after < stop
         index = tuple(
             n + jnp.where(going & (p <= crossing), jnp.where(v > 0, 1, -1), 0)
@@ -290,9 +331,8 @@ def _stride(axes: tuple[Axis, ...], o: Array, w: Array, start: Array, stop: Arra
 
     def step(carry):
         number, state = carry
-        t = start + (number + 0.5) * length
-        middle = tuple(x + t * v for x, v in zip(xs, ws, strict=True))
-        return number + 1, add(state, middle, None, jnp.where(number < count, length, 0.0))
+        point = lambda s: tuple(x + (start + number * length + s) * v for x, v in zip(xs, ws, strict=True))
+        return number + 1, add(state, point, None, jnp.where(number < count, length, 0.0))
 
     most = jnp.max(count, initial=0.0)
     return lax.while_loop(lambda carry: carry[0] < most, step, (jnp.zeros((), o.dtype), state))[1]

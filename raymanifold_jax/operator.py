@@ -31,7 +31,8 @@ from .scene import Scene, Wall
 from .surfaces import Surfaces, patch_points
 from .texture import Texture, mean_values
 from .transport.characteristic import Inflow, count_laps, mark_hits, thin_limit
-from .transport.derivative import swept, unswept
+from .transport.derivative import Manner, swept, unswept
+from .transport.slopes import THIN, source_slopes
 
 _MOST_LAPS = 1 << 16
 _ROUNDS = 1  # of Sinkhorn's iteration; each halves what bias is left, or better, and costs about four sweeps
@@ -130,19 +131,26 @@ class Transport(eqx.Module):
     voxel_sums: Float[Array, "C nx ny nz"]
     coverage: Float[Array, "nx ny nz"]  # weights of the paths through each voxel; 0 inside solids
     thin: bool = eqx.field(static=True)
+    onward: bool = eqx.field(static=True)  # see `SweptMedium`
     factors: Light | None = None  # what leaves is multiplied by, for the exchange of power to balance
+    # The medium's albedo times its factors, if light scattered in thick voxels has slopes.
+    albedo: Float[Array, "C nx ny nz"] | None = None
 
-    def __call__(self, leaving: Light, inflow: Inflow | None = None, fluence: bool = True) -> Light:
-        """Mean radiance arriving at elements and in voxels, of what leaves them and of what comes in through open sides."""
+    def __call__(self, leaving: Light, inflow: Inflow | None = None, fluence: bool = True, scattered: bool = False) -> Light:
+        """Mean radiance arriving at elements and in voxels, of what leaves them and of what comes in through open sides.
+
+        With `scattered` what leaves the voxels is scattered light, which in thick ones is linear; else it is even in each.
+        """
         leaving, inflow = _balanced(self.factors, leaving, inflow)
-        sums = _sweep(self.layout, self.ordinates, self.extinction, self.thin, leaving, inflow, fluence)
+        albedo = self.albedo if scattered else None
+        sums = _sweep(self, leaving, inflow, fluence, albedo)
         return _means(sums, Light(self.element_sums, self.voxel_sums))
 
-    def transposed(self, asked: Light) -> Light:
+    def transposed(self, asked: Light, scattered: bool = False) -> Light:
         """The transpose in what leaves: weights of arriving light back to weights of what was sent."""
         sums = Light(self.element_sums, None if asked.voxels is None else self.voxel_sums)
-        weights = jax.tree.map(_ratio, asked, sums)
-        sent = _transposed(self.layout, self.ordinates, self.extinction, self.thin, weights)
+        albedo = self.albedo if scattered else None
+        sent = _transposed(self, jax.tree.map(_ratio, asked, sums), albedo)
         return _balanced(self.factors, sent, None)[0]
 
 
@@ -180,7 +188,7 @@ def _balance(transport: Transport, area: Float[Array, " E"]) -> Transport:
         sums = Light(sums.elements, transport.voxel_sums)
     factors = Light(jnp.ones_like(power.elements))
     for _ in range(_ROUNDS):
-        sent = _transposed(layout, transport.ordinates, extinction, transport.thin, jax.tree.map(_ratio, power, sums))
+        sent = _transposed(transport, jax.tree.map(_ratio, power, sums))
         factors = jax.tree.map(_factor, power, sent)
         swept = _furnace(transport, factors)
         sums = Light(swept.elements, None if power.voxels is None else swept.voxels)
@@ -192,8 +200,13 @@ def _factor(wanted: Array, sent: Array) -> Array:
     return jnp.clip(jnp.where(sent > 0, wanted / jnp.where(sent > 0, sent, 1.0), 1.0), 0.5, 2.0)
 
 
-def _transposed(layout: Layout, ordinates, extinction, thin: bool, asked: Light) -> Light:
-    return Light(*unswept(layout, ordinates, extinction, thin, asked.elements, asked.voxels))
+def _transposed(transport: Transport, asked: Light, albedo=None) -> Light:
+    manner = Manner(transport.thin, transport.onward)
+    known = manner, transport.layout, transport.ordinates, transport.extinction
+    exitance, source, slopes = unswept(*known, asked.elements, asked.voxels, albedo is not None)
+    if slopes is not None and source is not None:
+        source = source + _unsloped(transport.layout, slopes, albedo, transport.extinction)
+    return Light(exitance, source)
 
 
 @jax.jit
@@ -201,8 +214,25 @@ def _ratio(sums: Array, furnace: Array) -> Array:
     return jnp.where(furnace > 0, sums / jnp.where(furnace > 0, furnace, 1.0), 0.0)
 
 
-def _sweep(layout, ordinates, extinction, thin, leaving: Light, inflow: Inflow | None, fluence: bool) -> Light:
-    return Light(*swept(layout, ordinates, extinction, thin, leaving.elements, leaving.voxels, inflow, fluence))
+def _sweep(transport: Transport, leaving: Light, inflow: Inflow | None, fluence: bool, albedo=None) -> Light:
+    """Sums of light; sources in the voxels have slopes if the `albedo` is given that they come by."""
+    slopes = None
+    if albedo is not None and leaving.voxels is not None:
+        slopes = _slopes(transport.layout, leaving.voxels, albedo, transport.extinction)
+    manner = Manner(transport.thin, transport.onward, fluence)
+    known = manner, transport.layout, transport.ordinates, transport.extinction
+    return Light(*swept(*known, leaving.elements, leaving.voxels, slopes, inflow))
+
+
+@eqx.filter_jit
+def _slopes(layout: Layout, source, albedo, extinction) -> tuple[Array, ...]:
+    return source_slopes(layout, layout.to_padded(source), layout.to_padded(albedo), extinction)
+
+
+@eqx.filter_jit
+def _unsloped(layout: Layout, slopes: tuple[Array, ...], albedo, extinction) -> Array:
+    """The transpose of `_slopes` in the source."""
+    return jax.vjp(lambda source: _slopes(layout, source, albedo, extinction), jnp.zeros_like(albedo))[1](slopes)[0]
 
 
 _mark_hits = eqx.filter_jit(mark_hits)
@@ -211,7 +241,7 @@ _count_laps = eqx.filter_jit(count_laps)
 
 def _furnace(transport: Transport, leaving: Light) -> Light:
     """The sums at elements and, outside solids, in voxels for light of 1, or in proportion to it."""
-    sums = _sweep(transport.layout, transport.ordinates, transport.extinction, transport.thin, leaving, None, True)
+    sums = _sweep(transport, leaving, None, True)
     assert sums.voxels is not None
     return Light(sums.elements, jnp.where(_solid(transport.layout), 0.0, sums.voxels))
 
@@ -225,30 +255,35 @@ def make_transport(
     quadrature: Quadrature,
     extinction: Float[Array, "C nx ny nz"] | None,
     bands: int,
-    mirrored: bool = True,
+    beam: bool = False,
     area: Float[np.ndarray, " E"] | None = None,
+    albedo: Float[Array, "C nx ny nz"] | None = None,
 ) -> Transport:
     """Prepare the sweeps of one set of directions over a layout.
 
-    With `mirrored`, directions on one side of the mirrors stand for their reflections too; without, they are swept as given.
+    With `area`, of the elements, the exchange of power is balanced. Where voxels are optically thick, light read next to a
+    surface is carried on to it and, with `albedo`, of the medium, scattered light is linear in each voxel. Directions on one
+    side of the mirrors stand for their reflections too; those of a `beam` do not, and its light is read as it is found:
+    carried on to a surface it would lose what it loses along it.
 
     **Raises** `ValueError` where rays along a periodic axis never end.
     """
     # What no parameter moves is worked out now, even while JAX traces the rest.
-    with nullcontext() if checks.is_traced(extinction) else jax.ensure_compile_time_eval():
-        return _make_transport(layout, quadrature, extinction, bands, mirrored, area)
+    with nullcontext() if checks.is_traced((extinction, albedo)) else jax.ensure_compile_time_eval():
+        return _make_transport(layout, quadrature, extinction, bands, beam, area, albedo)
 
 
-def _make_transport(layout: Layout, quadrature: Quadrature, extinction, bands: int, mirrored: bool, area) -> Transport:
-    if mirrored and layout.unfolding.axes:
+def _make_transport(layout: Layout, quadrature: Quadrature, extinction, bands: int, beam: bool, area, albedo) -> Transport:
+    if not beam and layout.unfolding.axes:
         quadrature = quadrature.mirrored(layout.unfolding.axes)
     largest_plane = int(np.prod(sorted(layout.padded)[1:]))
     with jax.ensure_compile_time_eval():
         ordinates = _mark_hits(layout, make_ordinates(quadrature, bands, largest_plane))
     padded = None if extinction is None else layout.to_padded(extinction)
-    thin = extinction is not None and checks.surely(
-        jnp.max(extinction) * (np.sqrt(3) * layout.spacing) <= thin_limit(extinction.dtype)
-    )
+    thickest = None if extinction is None else lax.stop_gradient(jnp.max(extinction)) * layout.spacing
+    # Programs differ by these: where the extinction is not known yet, by the one that always serves.
+    thin = thickest is not None and checks.surely(thickest * np.sqrt(3) <= thin_limit(thickest.dtype))
+    thick = thickest is not None and not checks.surely(thickest <= THIN)
     if 0 in layout.pad:
         ordinates, longest = _count_laps(layout, ordinates, lax.stop_gradient(padded), _MOST_LAPS)
         if checks.surely(longest >= _MOST_LAPS):
@@ -257,9 +292,14 @@ def _make_transport(layout: Layout, quadrature: Quadrature, extinction, bands: i
                 "a surface, an open side or an absorbing medium; close or open another side, or add absorption"
             )
     ones = lambda *shape: jnp.ones((bands, *shape), layout.plane.dtype)
-    transport = Transport(layout, ordinates, padded, ones(), ones(), ones(), thin)
+    transport = Transport(layout, ordinates, padded, ones(), ones(), ones(), thin, thick and not beam)
     sums = _furnace(transport, Light(ones(layout.elements), None if extinction is None else ones(*layout.shape)))
     assert sums.voxels is not None
     fields = {"element_sums": sums.elements, "voxel_sums": sums.voxels, "coverage": sums.voxels[0]}
     transport = dataclasses.replace(transport, **fields)
-    return transport if area is None else _balance(transport, jnp.asarray(area, layout.plane.dtype))
+    if area is not None:
+        transport = _balance(transport, jnp.asarray(area, layout.plane.dtype))
+    if thick and albedo is not None:
+        factor = 1.0 if transport.factors is None or transport.factors.voxels is None else transport.factors.voxels
+        transport = dataclasses.replace(transport, albedo=albedo * factor, thin=False)
+    return transport

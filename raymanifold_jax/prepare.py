@@ -21,23 +21,23 @@ from .surfaces import Surfaces, find_surfaces
 
 
 class Prepared:
-    """Surfaces and layout of a geometry; `transport` keeps what was made for an extinction while that stays the same."""
+    """Surfaces and layout of a geometry; `transport` keeps what was made for a medium while that stays the same."""
 
     def __init__(self, surfaces: Surfaces, layout: Layout):
         self.surfaces, self.layout = surfaces, layout
-        self._kept: dict[Hashable, tuple[np.ndarray | None, Any, Any]] = {}
+        self._kept: dict[Hashable, tuple[list[np.ndarray], Any, Any]] = {}
 
-    def transport(self, key: Hashable, extinction: jax.Array | None, make: Callable[[], Any], alive: Any = None) -> Any:
-        """`make()`, or what it gave before for the same `key` and an equal `extinction`.
+    def transport(self, key: Hashable, medium: Any, make: Callable[[], Any], alive: Any = None) -> Any:
+        """`make()`, or what it gave before for the same `key` and equal arrays of the `medium`.
 
         `alive` is kept as well: an object whose id is part of the key.
         """
-        if checks.is_traced(extinction):
+        if checks.is_traced(medium):
             return make()
-        now = None if extinction is None else np.asarray(extinction)
-        before, kept, _ = self._kept.get(key, (None, None, None))
-        same = kept is not None and (now is before or (now is not None and before is not None and np.array_equal(now, before)))
-        if not same:
+        now = [np.asarray(leaf) for leaf in jax.tree.leaves(medium)]
+        before, kept, _ = self._kept.get(key, ([], None, None))
+        same = len(now) == len(before) and all(map(np.array_equal, now, before))
+        if kept is None or not same:
             kept = make()
             if not checks.is_traced(kept):
                 self._kept[key] = now, kept, alive

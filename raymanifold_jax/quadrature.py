@@ -12,7 +12,13 @@ Each direction also has an `offsets` entry, the fractional position in its voxel
 the first component belongs to the larger of the two slopes. By default they follow Roberts' R2 sequence, frac(1/2 + i
 (1/r, 1/r^2)) with r^3 = r + 1 and i = 1, 2, ..., which keeps rays off edges and corners.
 
-Public names: `Quadrature`, `fibonacci`, `light_ray_cube`, `cube_points`, `product`, `from_directions`.
+Which to take (`for_scene` does): at equal numbers `fibonacci` and `cube` do about as well as each other in rooms and in fog,
+`product` a little worse. Next to mirrors `cube` is several times better, because the part of it on one side of them is as
+regular as the whole: Kobayashi's cube in a cube (three mirrors; flux at 20 points, 20 voxels, against 12800 directions) is
+off by rms 0.8 % with cube(6) and 0.2 % with cube(8), by 3.8 % and 2.0 % with fibonacci(200) and (400), by 2.5 % and 1.2 %
+with product(10, 20) and (14, 28).
+
+Public names: `Quadrature`, `fibonacci`, `cube`, `light_ray_cube`, `cube_points`, `product`, `for_scene`, `from_directions`.
 """
 
 from collections.abc import Iterable
@@ -23,6 +29,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from . import checks
+from .scene import MIRROR, Scene
 
 _SPHERE = 4 * np.pi
 _FIBONACCI_MINIMUM = 9  # from here on the nine moments can be met, with weights within 30 % of equal
@@ -88,9 +95,9 @@ class Quadrature(eqx.Module):
     def mirrored(self, axes: Iterable[int]) -> "Quadrature":
         """The directions with w >= 0 along each of `axes` (out of 0, 1, 2), to be used with their mirror images.
 
-        Weights are scaled so that the set and its images add up to 4 pi. A direction with w = 0 exactly is its own
-        image, and counts half. With the images, the first moment along `axes` is 0; the other moments need not stay
-        exact.
+        Weights are changed so that over the part of the sphere that is left all moments up to the second are exact, the
+        fluxes to the mirrors among them; if that would take changes by more than a half, they are only scaled to add up to
+        their share of 4 pi. A direction with w = 0 exactly is its own image, and counts half.
         """
         axes = sorted(set(axes))
         if any(axis not in (0, 1, 2) for axis in axes):
@@ -103,6 +110,8 @@ class Quadrature(eqx.Module):
             )
         weights = self.weights[kept] * 0.5 ** np.sum(along[kept] == 0, axis=1)
         weights *= _SPHERE / 2 ** len(axes) / weights.sum()
+        exact = _solved(self.directions[kept], weights, _part_moments(axes))
+        weights = weights if exact is None or np.abs(exact / weights - 1).max() > 0.5 else exact
         return Quadrature(self.directions[kept], weights, self.offsets[kept], f"{self.name}, mirrored in {axes}")
 
 
@@ -121,6 +130,31 @@ def fibonacci(n: int) -> Quadrature:
     if n >= _FIBONACCI_MINIMUM:
         weights = _correct(directions, weights)
     return Quadrature(directions, weights, name=f"fibonacci({n})")
+
+
+def cube(side: int) -> Quadrature:
+    """6 `side`^2 directions, one to each cell of a cube whose faces are cut by equal angles; `side` even.
+
+    A direction points to the centre of gravity of its cell on the sphere, its weight is the cell's solid angle. The set is as
+    symmetric as a cube, and no direction lies in a plane of its mirrors: each half, quarter and octant of it is regular.
+    """
+    side = checks.positive_int("side", side, at_least=2)
+    if side % 2:
+        checks.fail("side", side, "an even number", f"use {side + 1}")
+    fine = 8  # samples of a cell along each edge, for its centre of gravity
+    edges = np.tan(np.pi / 4 * np.linspace(-1, 1, side + 1))
+    low, high = (np.stack(np.meshgrid(e, e, indexing="ij"), -1).reshape(-1, 2) for e in (edges[:-1], edges[1:]))
+    weights = np.tile(_rectangle(low, high, 1.0), 6)
+    x = np.tan(np.pi / 4 * (2 * (np.arange(side * fine) + 0.5) / (side * fine) - 1))
+    x, y = np.meshgrid(x, x, indexing="ij")
+    points = np.stack([x, y, np.ones_like(x)], -1)
+    # The samples' shares of solid angle, with the points made unit vectors.
+    points *= ((1 + x**2) * (1 + y**2) / (1 + x**2 + y**2) ** 2)[..., None]
+    centers = points.reshape(side, fine, side, fine, 3).sum((1, 3)).reshape(-1, 3)
+    centers /= np.linalg.norm(centers, axis=1, keepdims=True)
+    faces = [np.roll(centers * [1, 1, sign], axis, axis=1) for axis in range(3) for sign in (1, -1)]
+    directions = np.concatenate(faces)
+    return Quadrature(directions, _correct(directions, weights), name=f"cube({side})")
 
 
 def cube_points(half_width: int) -> Int[np.ndarray, "n 3"]:
@@ -172,6 +206,14 @@ def product(polar: int, azimuthal: int) -> Quadrature:
     return Quadrature(directions, _correct(directions, weights), name=f"product({polar}, {azimuthal})")
 
 
+def for_scene(scene: Scene, count: int = 200) -> Quadrature:
+    """What `rm.solve` takes: about `count` directions, of a `cube` next to mirrors, else of a `fibonacci` spiral."""
+    count = checks.positive_int("count", count)
+    if MIRROR not in scene.boundary.sides:
+        return fibonacci(count)
+    return cube(2 * max(1, round(np.sqrt(count / 24))))
+
+
 def from_directions(directions: Any, weights: Any = None, offsets: Any = None) -> Quadrature:
     """A set of your own: `directions` (n, 3) of any length but 0, `weights` (n,) > 0, by default equal.
 
@@ -210,15 +252,28 @@ def _rectangle(lower: np.ndarray, upper: np.ndarray, distance: float) -> np.ndar
     return from_foot(x1, y1) - from_foot(x0, y1) - from_foot(x1, y0) + from_foot(x0, y0)
 
 
+def _part_moments(axes: list[int]) -> np.ndarray:
+    """Integrals of x x, y y, z z, x, y, z, x y, y z, z x over the part of the sphere where w > 0 along each of `axes`."""
+    share = 0.5 ** len(axes)
+    halves = [2.0 * np.pi * share if a in axes else 0.0 for a in range(3)]
+    both = [8 / 3 * share if a in axes and b in axes else 0.0 for a, b in ((0, 1), (1, 2), (2, 0))]
+    return np.array([_SPHERE / 3 * share] * 3 + halves + both)
+
+
 def _correct(directions: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """`weights` changed as little as possible (least squares, relative) to have the exact moments 0, 1 and 2."""
+    exact = _solved(directions, weights, _part_moments([]))
+    if exact is None or exact.min() <= 0:
+        got = f"{len(weights)} directions"
+        checks.fail("quadrature", got, "enough to make the moments exact with positive weights", "use more directions")
+    return exact
+
+
+def _solved(directions: np.ndarray, weights: np.ndarray, target: np.ndarray) -> np.ndarray | None:
+    """Weights with the moments of `target`, which imply the sum; None if no such weights are found."""
     x, y, z = directions.T
     functions = np.stack([x * x, y * y, z * z, x, y, z, x * y, y * z, z * x])  # the sum is that of the first three
-    target = np.array([_SPHERE / 3] * 3 + [0.0] * 6)
     for _ in range(2):  # a second step takes off the first one's rounding
         missing = target - functions @ weights
         weights = weights * (1 + np.linalg.lstsq(functions * weights, missing, rcond=1e-10)[0])
-    if weights.min() <= 0 or np.abs(functions @ weights - target).max() > 1e-10:
-        got = f"{len(weights)} directions"
-        checks.fail("quadrature", got, "enough to make the moments exact with positive weights", "use more directions")
-    return weights
+    return weights if np.abs(functions @ weights - target).max() <= 1e-10 else None

@@ -74,7 +74,10 @@ class Solution(eqx.Module):
     - `error_bound`: certified: no radiosity, and no medium source times pi, is further than this from the exact solution of
       the discrete problem (in radiosity units; rounding apart). inf where no bound is known, nan under `jit` and `vmap`.
     - `sweeps`: applications of the transport operator on the full lattice. `history`: the largest residual after each
-      sweep, in radiosity units. `result`: how the iteration ended, in words; `converged`: whether it met the tolerance.
+      sweep, in radiosity units. `ending`: "converged", "sweep limit", "stagnated", "diverged" or "no bound"; `result`: the same
+      in a sentence, with advice; `converged`: whether the bound met the tolerance; `solver`: which one it was.
+    - `rounding`: what the float type's rounding in the sweeps may add to the error, in radiosity units; an estimate.
+    - `no_bound`: why there is no error bound; empty where there is one.
     - `diffuse_*` and `sun_*`: (bands, ...), the light of the suns' direct beams, and all other light.
     """
 
@@ -91,8 +94,10 @@ class Solution(eqx.Module):
     target: float = eqx.field(static=True)
     history: np.ndarray
     sweeps: int = eqx.field(static=True)
-    converged: bool = eqx.field(static=True)
-    stagnated: bool = eqx.field(static=True)
+    ending: str = eqx.field(static=True)
+    solver: str = eqx.field(static=True)
+    rounding: float = eqx.field(static=True)
+    no_bound: str = eqx.field(static=True)
     _hidden: _Hidden = eqx.field(static=True)
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -144,20 +149,29 @@ class Solution(eqx.Module):
         )
 
     @property
+    def converged(self) -> bool:
+        """Whether the error bound meets the tolerance."""
+        return self.ending == "converged"
+
+    @property
     def result(self) -> str:
         """How the iteration ended."""
         bound, target, count = self.error_bound, self.target, self.sweeps
         if np.isnan(bound):
             return "solved inside a program that JAX traced (jit, vmap), which keeps no bound"
         if self.converged:
-            return f"converged: error bound {bound:.3g} is within the target {target:.3g} after {count} sweeps"
-        if not np.isfinite(bound):
-            ending = "no error bound: some light bounces without loss; lower an albedo below 1, or open a side"
-        elif self.stagnated:
-            ending = "stagnated at the float type's rounding; raise rtol, or enable float64"
-        else:
-            ending = "sweep limit reached; raise max_sweeps or rtol"
-        return f"not converged after {count} sweeps (bound {bound:.3g}, target {target:.3g}): {ending}"
+            text = f"converged: error bound {bound:.3g} is within the target {target:.3g} after {count} sweeps ({self.solver})"
+            rounding = f"; rounding may add up to {self.rounding:.3g}: enable float64 if that matters"
+            return text + rounding * (self.rounding > target)
+        ending = {
+            "no bound": f"no error bound: {self.no_bound}; lower an albedo below 1, or open a side",
+            "stagnated": "stagnated at the float type's rounding; raise rtol, or enable float64",
+            "diverged": 'diverged: the residual grew a thousandfold; use solver="auto", and report the scene if it did',
+            "sweep limit": "sweep limit reached; raise max_sweeps or rtol",
+        }[self.ending]
+        if self.no_bound and self.ending != "no bound":
+            ending += f"; and there is no error bound: {self.no_bound}; lower an albedo below 1, or open a side"
+        return f"not converged after {count} sweeps of {self.solver} (bound {bound:.3g}, target {target:.3g}): {ending}"
 
     def _banded(self, values: Float[jax.Array, "C *shape"]) -> Float[jax.Array, "*shape C"]:
         return jnp.moveaxis(values, 0, -1) if self.scene.banded else values[0]

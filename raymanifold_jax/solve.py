@@ -8,6 +8,7 @@ Public: `solve`.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -18,23 +19,24 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from . import checks
+from .acceleration import make_diffusion
 from .checkpoint import Checkpoint
 from .direct import first_flight, sky_radiance
 from .implicit import Unwatched, attach, stop_gradient
-from .iteration import Iteration, Jacobi, Krylov, System, certify
+from .iteration import Iteration, System, certify
 from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
+from .optimistix_solver import OptimistixFixedPoint
 from .prepare import Prepared, prepare
 from .progress import Progress, make_progress
-from .quadrature import Quadrature, fibonacci
+from .quadrature import Quadrature, for_scene
 from .scene import OPEN, PointLight, Scene, Sky, Sun
 from .solution import Energy, Solution, _Hidden
+from .solvers import Anderson, Jacobi, Krylov, automatic
 from .surfaces import Surfaces
 from .transport.characteristic import Characteristic
 from .transport.light_ray_cube import LightRayCube
 from .transport.ray_cube_system import CubeSystem, make_cube_system
-
-_DEFAULT_DIRECTIONS = 200
 
 
 def solve(
@@ -42,7 +44,7 @@ def solve(
     quadrature: Quadrature | None = None,
     scheme: Characteristic | LightRayCube | None = None,
     rtol: float = 1e-4,
-    solver: Jacobi | Krylov | str = "auto",
+    solver: Jacobi | Krylov | Anderson | OptimistixFixedPoint | str = "auto",
     max_sweeps: int = 1000,
     throw: bool = False,
     progress: bool | Progress | None = None,
@@ -58,12 +60,14 @@ def solve(
 
     **Arguments:**
 
-    - `quadrature`: directions of the sweeps; `rm.quadrature.fibonacci(200)` if None. More directions reduce ray effects; time
-      grows with their number.
+    - `quadrature`: directions of the sweeps; `rm.quadrature.for_scene(scene)` if None, about 200. More directions reduce ray
+      effects; time grows with their number.
     - `scheme`: `rm.Characteristic()`, or the paper's `rm.LightRayCube(half_width=5)`, which brings its own directions:
       leave `quadrature` out.
     - `rtol`: the certified error bound's target, relative to the largest radiosity or medium source (times pi).
-    - `solver`: `rm.Krylov()`, which is also what "auto" takes, or the paper's `rm.Jacobi()`, "auto" with its scheme.
+    - `solver`: `rm.Krylov()`, `rm.Anderson()`, `rm.OptimistixFixedPoint(...)` or the paper's `rm.Jacobi()`. "auto" takes
+      `Jacobi` with the paper's scheme and where little is reflected, else `Krylov`, with diffusion where light bounces often or
+      the medium is thick: see `Solution.solver`.
     - `max_sweeps`: the iteration stops there at the latest. With `Jacobi`, k of them are k of the paper's iterations: light
       straight from the sources, and k bounces. With `throw`, that raises `RuntimeError`; without, read
       `Solution.converged` and `Solution.result`.
@@ -77,7 +81,7 @@ def solve(
     """
     _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint, prepared)
     cube = scheme if isinstance(scheme, LightRayCube) else None
-    quadrature = fibonacci(_DEFAULT_DIRECTIONS) if quadrature is None else quadrature
+    quadrature = for_scene(scene) if quadrature is None else quadrature
     check_memory(scene.lattice.shape, scene.bands, len(quadrature), scene.medium is not None)
     meter = make_progress(progress)
     with meter:
@@ -85,38 +89,56 @@ def solve(
         prepared = prepare(scene) if prepared is None else prepared
         surfaces = prepared.surfaces
         stuff = materials(scene, surfaces)
+        _check_steady(scene, surfaces, stuff)
         nodes = None if cube is None else make_cube_system(scene, surfaces, cube)
         if nodes is not None:
             system, quadrature = nodes.system, nodes.quadrature
         else:
             area = surfaces.area if _exchanges(scene, stuff) else None
-            make = lambda: make_transport(prepared.layout, quadrature, stuff.extinction, scene.bands, area=area)
-            transport = prepared.transport((id(quadrature), scene.bands, area is None), stuff.extinction, make, quadrature)
+            albedo = stuff.scattering_albedo
+            make = lambda: make_transport(prepared.layout, quadrature, stuff.extinction, scene.bands, area=area, albedo=albedo)
+            key = (id(quadrature), scene.bands, area is None)
+            transport = prepared.transport(key, (stuff.extinction, albedo), make, quadrature)
             system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff, prepared))
-        automatic = Krylov() if nodes is None else Jacobi()
-        chosen = automatic if isinstance(solver, str) else solver
-        iteration = _iterate(system, float(rtol), chosen, max_sweeps, meter, checkpoint)
-        solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes)
+        iteration, solver = _iterate(
+            system, surfaces if nodes is None else None, float(rtol), solver, max_sweeps, meter, checkpoint
+        )
+        solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes, solver)
     if throw and not solution.converged:
         raise RuntimeError(f"solve: {solution.result}")
     return solution
 
 
 def _iterate(
-    system: Any, rtol: float, solver: Jacobi | Krylov, most: int, meter: Progress, checkpoint: Checkpoint | None
-) -> Iteration | Unwatched:
+    system: Any, surfaces: Surfaces | None, rtol: float, solver: Any, most: int, meter: Progress, checkpoint: Checkpoint | None
+) -> tuple[Iteration | Unwatched, Any]:
+    """The iteration when it is over, and the solver it was left to. `surfaces` is None in the paper's scheme."""
     traced = checks.is_traced(system)
     known = stop_gradient(system) if traced else system
     if checks.is_traced(known):
-        iteration = Unwatched(system, rtol, most)
+        iteration, near = Unwatched(system, rtol, most), None
+        solver = iteration.solver
     else:
+        near = None if surfaces is None else make_diffusion(known.transport, surfaces, known.materials)
+        known = known if near is None else dataclasses.replace(known, near=near)
+        if isinstance(solver, str):
+            solver = Jacobi() if near is None else automatic(known, _depth(known.materials, known.transport.layout.spacing))
         iteration = Iteration(known, certify(known), rtol, most, meter)
         if checkpoint is not None:
             iteration.resume(checkpoint)
         solver.run(iteration)
     if traced:
-        iteration.system, iteration.arriving = system, attach(system, iteration.arriving, rtol, most)
-    return iteration
+        iteration.system = dataclasses.replace(system, near=near)
+        iteration.arriving = attach(iteration.system, iteration.arriving, rtol, most)
+    return iteration, solver
+
+
+def _depth(stuff: Materials, spacing: float) -> float:
+    """The largest optical depth along an axis of the lattice, or a little more."""
+    if stuff.extinction is None:
+        return 0.0
+    along = [float(jnp.max(jnp.sum(stuff.extinction, axis))) for axis in (1, 2, 3)]
+    return max(along) * spacing
 
 
 def _exchanges(scene: Scene, stuff: Materials) -> bool:
@@ -145,8 +167,9 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
         checks.fail("scene", "traced geometry", expected, advice, TypeError)
     if isinstance(scheme, LightRayCube) and checks.is_traced(scene):
         checks.fail("scheme", f"{scheme} with traced values", "rm.Characteristic()", "only its sweeps have derivatives")
-    if not (isinstance(solver, Jacobi | Krylov) or solver == "auto"):
-        checks.fail("solver", repr(solver), 'rm.Jacobi(), rm.Krylov() or "auto"', 'leave it at "auto"')
+    if not (isinstance(solver, Jacobi | Krylov | Anderson | OptimistixFixedPoint) or solver == "auto"):
+        kinds = 'rm.Krylov(), rm.Anderson(), rm.OptimistixFixedPoint(...), rm.Jacobi() or "auto"'
+        checks.fail("solver", repr(solver), kinds, 'leave it at "auto"')
     if mesh is not None:
         checks.fail("mesh", repr(mesh), "None", "sweeps run on one device so far; leave mesh out")
     if checkpoint is not None:
@@ -164,6 +187,23 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
         )
 
 
+def _check_steady(scene: Scene, surfaces: Surfaces, stuff: Materials) -> None:
+    """Light must be able to end somewhere, if there is any."""
+    sources = [stuff.emission, *(f for f in (stuff.medium_source,) if f is not None)]
+    sources += [light.intensity for light in scene.lights if isinstance(light, PointLight)]
+    if checks.is_traced(stuff.albedo) or any(checks.is_traced(s) for s in sources):
+        return
+    lossless = np.all(np.asarray(stuff.albedo) >= 1, axis=1)
+    if stuff.absorption is not None:
+        lossless &= ~np.any(np.asarray(stuff.absorption) > 0, axis=(1, 2, 3))
+    if surfaces.open.any() or not lossless.any() or not any(np.any(np.asarray(s) > 0) for s in sources):
+        return
+    raise ValueError(
+        "scene: got sources in a closed scene where nothing absorbs (every albedo is 1), expected light to end somewhere: "
+        "there is no steady state; lower an albedo below 1, add absorption, or open a side"
+    )
+
+
 def _finish(
     scene: Scene,
     surfaces: Surfaces,
@@ -171,6 +211,7 @@ def _finish(
     stuff: Materials,
     iteration: Iteration | Unwatched,
     nodes: CubeSystem | None,
+    solver: object,
 ) -> Solution:
     system, bounced = iteration.system, iteration.arriving
     # Within its bound a Krylov iterate may dip below 0, where the exact solution is not.
@@ -197,7 +238,8 @@ def _finish(
         energy=_energy(scene, surfaces, quadrature, stuff, free, fields),
         error_bound=math.pi * iteration.bound, target=math.pi * iteration.target,
         history=math.pi * np.array(iteration.residuals[1:]), sweeps=iteration.sweeps + iteration.certificate.sweeps,
-        converged=iteration.converged, stagnated=iteration.stagnated,
+        ending=iteration.ending, solver=repr(solver), rounding=math.pi * iteration.rounding,
+        no_bound=iteration.certificate.reason if iteration.residuals[-1] > 0 else "",
         _hidden=_Hidden(surfaces),
     )  # fmt: skip
 

@@ -163,19 +163,26 @@ def _solid_normal(scene: Scene, u: Array) -> Array:
 
 
 def _visible(scene: Scene, start: Array, end: Array) -> Array:
+    return visible_unfolded(scene, to_voxel(scene, start), to_voxel(scene, end))
+
+
+def visible_unfolded(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"]) -> Float[Array, " n"]:
+    """`visible` for one block, between points in unfolded voxel coordinates."""
     if not scene.solids:
-        return jnp.ones(start.shape[:1], start.dtype)
-    o, e = to_voxel(scene, start), to_voxel(scene, end)
+        return jnp.ones(o.shape[:1], o.dtype)
+    axes = unfolded_axes(scene)
+    folds = any(axis.kind != "plain" for axis in axes)
+    distance = lambda u: _distance(scene, fold(axes, u)[0] if folds else u)
     length = jnp.sqrt(jnp.sum((e - o) ** 2, -1))
     w = (e - o) / jnp.where(length > 0, length, 1.0)[:, None]
     stop = length - _CRAWL
     # Points of elements may lie a little inside a curved solid: deeper than its ends a ray must not go.
-    ends = jnp.minimum(_distance(scene, o), _distance(scene, e))
+    ends = jnp.minimum(distance(o), distance(e))
     deepest = jnp.clip(ends, -10 * _BEHIND, 0.0) - _CRAWL
 
     def step(state):
         t, blocked, count = state
-        near = _distance(scene, o + t[:, None] * w)
+        near = distance(o + t[:, None] * w)
         going = ~blocked & (t < stop)
         return jnp.where(going, t + jnp.maximum(jnp.abs(near), _BEHIND), t), blocked | (going & (near < deepest)), count + 1
 
@@ -184,4 +191,4 @@ def _visible(scene: Scene, start: Array, end: Array) -> Array:
         return (~blocked & (t < stop)).any() & (count < _STEPS)
 
     _, blocked, _ = lax.while_loop(goes_on, step, (jnp.zeros_like(stop), jnp.zeros(stop.shape, bool), 0))
-    return jnp.where(blocked, 0.0, 1.0).astype(start.dtype)
+    return jnp.where(blocked, 0.0, 1.0).astype(o.dtype)

@@ -38,7 +38,8 @@ class Axis(NamedTuple):
     lower: float
     upper: float
 
-    def fold_index(self, index: Array) -> Array:
+    def fold_index(self, index: Array, beyond: int = 0) -> Array:
+        """The voxel in the lattice; behind a side that ends it, at most `beyond` past the last."""
         n = self.count
         if self.kind == "periodic":
             return index % n
@@ -48,7 +49,7 @@ class Axis(NamedTuple):
             index = jnp.where(index < 0, -1 - index, index)
         elif self.kind != "plain":
             index = jnp.where(index >= n, 2 * n - 1 - index, index)
-        return jnp.clip(index, 0, n - 1)
+        return jnp.clip(index, -beyond, n - 1 + beyond)
 
     def fold(self, u: Array) -> tuple[Array, Array]:
         """Coordinate in the lattice, and the sign that a direction gets."""

@@ -22,7 +22,12 @@ UNEVEN = rm.quadrature.Quadrature([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], [1.0, 1.0
         (SCENE, {"quadrature": UNEVEN}, ValueError, r"quadrature: got weights that add up to 2, expected 4 pi"),
         (SCENE, {"scheme": "characteristic"}, TypeError, r"scheme: got characteristic.*use rm\.Characteristic\(\)"),
         (SCENE, {"scheme": rm.Characteristic}, TypeError, r"scheme: got the class Characteristic itself"),
-        (SCENE, {"solver": "gmres"}, ValueError, r"solver: got 'gmres', expected rm\.Jacobi\(\), rm\.Krylov\(\) or \"auto\""),
+        (
+            SCENE,
+            {"solver": "gmres"},
+            ValueError,
+            r"solver: got 'gmres', expected rm\.Krylov\(\), rm\.Anderson\(\), .* or \"auto\"",
+        ),
         (SCENE, {"solver": None}, ValueError, r"solver: got None"),
         (SCENE, {"mesh": 4}, ValueError, r"mesh: got 4, expected None"),
         (SCENE, {"max_sweeps": 0}, ValueError, r"max_sweeps: got 0, expected a whole number >= 1"),

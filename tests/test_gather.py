@@ -48,8 +48,10 @@ def stand_in(scene: rm.Scene, irradiance: Any = 0.0, fluence: Any = 0.0) -> Solu
         target=0.0,
         history=np.zeros(0),
         sweeps=0,
-        converged=True,
-        stagnated=False,
+        ending="converged",
+        solver="none",
+        rounding=0.0,
+        no_bound="",
         _hidden=_Hidden(surfaces),
     )
 
@@ -145,7 +147,7 @@ def test_furnace_is_the_same_everywhere(scattering):
     directions = np.random.default_rng(1).normal(size=(3000, 3))
     assert_close(rm.radiance(solution, origins, directions), light, rtol=1e-5)
     assert_close(rm.irradiance(solution, *on_ball(20), directions=64), np.pi * light, rtol=1e-5)
-    assert_close(rm.fluence(solution, origins), 4 * np.pi * light, rtol=1e-5)
+    assert_close(rm.fluence(solution, origins[:40], directions=64), 4 * np.pi * light, rtol=1e-5)
 
 
 def test_bands_and_materials():
@@ -183,7 +185,7 @@ def test_half_plane_shadow_is_sharp():
     # As radiance, seen from just above, the sun alone is left: the slab is black and nothing else shines.
     seen = rm.radiance(stand_in(scene), points + above, -up)
     assert_close(seen, np.array([lit, 0, lit, 0]) * 0.5 / np.pi, rtol=1e-5, atol=1e-7)
-    assert_close(rm.fluence(stand_in(scene), points + 1e-5 * above), [3, 0, 3, 0], rtol=1e-5, atol=1e-7)
+    assert_close(rm.fluence(stand_in(scene), points + 1e-5 * above, directions=0), [3, 0, 3, 0], rtol=1e-5, atol=1e-7)
 
 
 def test_sun_comes_in_by_open_sides_only_and_is_attenuated():
@@ -192,7 +194,7 @@ def test_sun_comes_in_by_open_sides_only_and_is_attenuated():
     medium = rm.Medium(absorption=2.0)
     scene = rm.Scene(LATTICE, medium=medium, lights=[rm.Sun(direction, 1.0)], boundary=closed(0.0, top=rm.OPEN))
     points = np.array([[0.999, 0.5, 0.2], [0.5, 0.5, 0.2]])
-    assert_close(rm.fluence(stand_in(scene), points), [np.exp(-2 * 0.8 * np.sqrt(2)), 0], rtol=1e-4)
+    assert_close(rm.fluence(stand_in(scene), points, directions=0), [np.exp(-2 * 0.8 * np.sqrt(2)), 0], rtol=1e-4)
     walls = rm.irradiance(stand_in(scene), [[1.0, 0.5, 0.2], [0.0, 0.5, 0.2]], [[-1, 0, 0], [1, 0, 0]], 16)
     assert_close(walls, [np.exp(-2 * 0.8 * np.sqrt(2)) / np.sqrt(2), 0], rtol=1e-3, atol=1e-6)
 
@@ -203,9 +205,9 @@ def test_sun_by_way_of_a_mirror():
     boundary = rm.Boundary(x=(rm.OPEN, rm.MIRROR), y=rm.OPEN, z=(rm.Wall(0.0), rm.OPEN))
     scene = rm.Scene(LATTICE, lights=[rm.Sun(direction, 1.0)], boundary=boundary)
     points = np.array([[0.7, 0.5, 0.01], [0.2, 0.5, 0.5]])
-    assert_close(rm.fluence(stand_in(scene), points), [2, 1], rtol=1e-5)
+    assert_close(rm.fluence(stand_in(scene), points, directions=0), [2, 1], rtol=1e-5)
     across = rm.Scene(LATTICE, lights=[rm.Sun((0, 0, -1), 1.0)], boundary=boundary)
-    assert_close(rm.fluence(stand_in(across), points), [1, 1], rtol=1e-5)
+    assert_close(rm.fluence(stand_in(across), points, directions=0), [1, 1], rtol=1e-5)
 
 
 def test_sun_round_a_periodic_side():
@@ -217,7 +219,7 @@ def test_sun_round_a_periodic_side():
     # Shaded: from 0.6 + 0.4 to 0.9 + 0.5, less a period.
     x = np.array([0.03, 0.38, 0.43, 0.97])
     points = np.stack([x, 0 * x + 0.5, 0 * x + 1e-6], 1)
-    assert_close(rm.fluence(stand_in(scene), points), [0, 0, 1, 1], atol=1e-5)
+    assert_close(rm.fluence(stand_in(scene), points, directions=0), [0, 0, 1, 1], atol=1e-5)
 
 
 def test_mirrors_reflect_what_an_eye_sees():
@@ -275,7 +277,7 @@ def test_fluence_is_linear_between_centres_and_skips_solids():
     scene = rm.Scene(LATTICE, [rm.Solid(rm.HalfSpace((0.5, 0.5, 0.5), (0, 0, 1)))], boundary=closed())
     solution = stand_in(scene, fluence=lambda x: 3 + x[..., 0])
     points = np.random.default_rng(0).uniform((0.05, 0.05, 0.5), 0.95, (200, 3))
-    assert_close(rm.fluence(solution, points), 3 + points[:, 0], rtol=1e-5)
+    assert_close(rm.fluence(solution, points, directions=0), 3 + points[:, 0], rtol=1e-5)
 
 
 def test_outgoing_flux_lies_as_the_lattice_does():

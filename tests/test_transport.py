@@ -248,8 +248,8 @@ def test_bands_are_separate_solves():
     for band in range(3):
         grey = solve(scene(band), rtol=1e-5)
         assert grey.fluence.shape == (8, 8, 8) and grey.surfaces.radiosity.ndim == 1
-        np.testing.assert_allclose(rgb.fluence[..., band], grey.fluence, rtol=3e-5)
-        np.testing.assert_allclose(rgb.surfaces.radiosity[:, band], grey.surfaces.radiosity, rtol=3e-5)
+        np.testing.assert_allclose(rgb.fluence[..., band], grey.fluence, rtol=5e-5)
+        np.testing.assert_allclose(rgb.surfaces.radiosity[:, band], grey.surfaces.radiosity, rtol=5e-5)
 
 
 @pytest.mark.slow

@@ -7,9 +7,10 @@ everywhere", Langer, Breton & Zucker 1995, section 4). Over the free part of a s
 
     L' = S + (L - S) exp(-tau),    mean = S + (L - S) (1 - exp(-tau)) / tau,
 
-with S the source function. A surface is the plane g(e) = offset + n . e = 0 in its voxel, e from the voxel's centre: where g
-changes from + to - along a segment the ray arrives at the surface and leaves as the surface's exitant radiance; where it
-changes from - to +, the free part begins at the surface.
+with S the source function; the source of light scattered in thick voxels is linear instead (see `slopes`). A surface is the
+plane g(e) = offset + n . e = 0 in its voxel, e from the voxel's centre: where g changes from + to - along a segment the ray
+arrives at the surface and leaves as the surface's exitant radiance; where it changes from - to +, the free part begins at
+the surface.
 
 Public: `Characteristic`, `sweep`, `SweptMedium`, `Inflow`, `mark_hits`, `count_laps`, `thin_limit`.
 """
@@ -29,10 +30,12 @@ from jaxtyping import Array, Float, Int, UInt32
 
 from ..layout import AXES, AxisReads, Layout, Ordinates, Reads
 from ..shift import shift
+from .slopes import thickness
 
 #: A ray counts as arriving at an element if it is at most this far (voxels) behind its plane where it enters the voxel: the
 #: planes of neighbouring voxels on a curved surface do not join exactly.
 _BEHIND = 0.05
+_ONWARD = 2.0  # planes: how far radiance from a probe voxel is carried on at most
 
 
 def thin_limit(real) -> float:
@@ -50,6 +53,8 @@ class SweptMedium(eqx.Module):
     extinction: Float[Array, "C X Y Z"]  # 1 / scene unit
     source: Float[Array, "C X Y Z"]  # source function, W m^-2 sr^-1
     thin: bool = eqx.field(static=True, default=False)  # no path through a voxel is optically longer than `thin_limit`
+    slopes: tuple[Float[Array, "C X Y Z"], ...] | None = None  # of the source along x, y, z, per voxel's side
+    onward: bool = eqx.field(static=True, default=False)  # whether light read in probe voxels is carried on to the surface
 
 
 class Inflow(eqx.Module):
@@ -180,7 +185,9 @@ def _fields(layout: Layout, axis: int, surface: Float[Array, "C X Y Z"], medium:
         exitance=_planes(surface, axis),
         extinction=None if medium is None else _planes(medium.extinction, axis),
         source=None if medium is None else _planes(medium.source, axis),
+        slopes=None if medium is None or medium.slopes is None else tuple(_planes(medium.slopes[a], axis) for a in AXES[axis]),
         thin=medium is not None and medium.thin,
+        onward=medium is not None and medium.onward,
     )
     occupied = jnp.any(_planes(surface_voxel, axis), axis=-1)
     return fields, occupied, _planes(layout.inflow_image, axis) if inflow else None
@@ -315,19 +322,27 @@ class _Fields(eqx.Module):
     exitance: Array
     extinction: Array | None
     source: Array | None
+    slopes: tuple[Array, ...] | None  # of the source along the sweep axis, u and v
     thin: bool = eqx.field(static=True)
+    onward: bool = eqx.field(static=True)
 
     def cells(self, cells: Int[Array, " T"]) -> _Fields:
         return jax.tree.map(lambda a: a[..., cells], self)
 
     @property
     def sent(self) -> tuple[Array, ...]:
-        """What a sweep is linear in: the exitance and, with a medium, the source."""
-        return (self.exitance,) if self.source is None else (self.exitance, self.source)
+        """What a sweep is linear in: the exitance, with a medium the source, and its slopes if it has any."""
+        return (self.exitance, *(() if self.source is None else (self.source,)), *(self.slopes or ()))
 
     def sending(self, sent: tuple[Array, ...]) -> _Fields:
-        """The same geometry with other light: exitance, source and, if given, extinction."""
-        return dataclasses.replace(self, **dict(zip(("exitance", "source", "extinction"), sent, strict=False)))
+        """The same geometry with other light and, if it comes last, other extinction."""
+        if self.source is None:
+            return dataclasses.replace(self, exitance=sent[0])
+        end = 2 + len(self.slopes or ())
+        extinction = sent[end] if len(sent) > end else self.extinction
+        return dataclasses.replace(
+            self, exitance=sent[0], source=sent[1], slopes=self.slopes and sent[2:end], extinction=extinction
+        )
 
 
 def _chords(own: Ordinates, step: Int[Array, ""], width: int, wrap_v: bool) -> Chords:
@@ -401,22 +416,44 @@ def _free_part(plane: _Plane, start: tuple, share: Array) -> _Free:
     return _Free(g0 < 0, g1 < 0, jnp.maximum(free, 0.0))
 
 
-def _attenuate(radiance, plane: _Fields, length):
+class _Source(NamedTuple):
+    """The source function in the middle of a path, and how far it rises along it (None: it is constant)."""
+
+    middle: Array
+    rise: Array | None
+
+
+def _source(fields: _Fields, chords: Chords, number: int, start, path) -> _Source | None:
+    """The source along a part of segment `number`: from `start`, a share of the step counted from the segment's, on."""
+    if fields.source is None or fields.slopes is None:
+        return None if fields.source is None else _Source(fields.source, None)
+    along = lambda point: sum(s * x[:, None, None] for s, x in zip(fields.slopes or (), point, strict=True))
+    slope = along(chords.step)
+    return _Source(fields.source + along(chords.ends[number][0]) + slope * (start + path / 2), slope * path)
+
+
+def _attenuate(radiance, plane: _Fields, source: _Source | None, length):
     """Radiance at the end of a path and its mean over it, in the medium."""
-    if plane.extinction is None or plane.source is None:
+    if plane.extinction is None or source is None:
         return radiance, radiance
     tau = plane.extinction * length
     mean = 1 - tau * (1 / 2 - tau * (1 / 6 - tau * (1 / 24 - tau * (1 / 120 - tau * (1 / 720 - tau * (1 / 5040))))))
-    excess = radiance - plane.source
+    excess = radiance - source.middle
     if plane.thin:
-        return radiance - tau * (mean * excess), plane.source + mean * excess
+        return radiance - tau * (mean * excess), source.middle + mean * excess
     transmittance = jnp.exp(-tau)
     limit = thin_limit(tau.dtype)
     thin = tau < limit
     mean = jnp.where(thin, mean, (1 - transmittance) / jnp.maximum(tau, limit))
     # The first form keeps the light a thin path adds, the second the light a thick one lets through.
-    end = jnp.where(thin, radiance - tau * mean * excess, plane.source + transmittance * excess)
-    return end, plane.source + mean * excess
+    end = jnp.where(thin, radiance - tau * mean * excess, source.middle + transmittance * excess)
+    average = source.middle + mean * excess
+    if source.rise is not None:
+        # A linear source adds ((1 + T) / 2 - mean) times its rise to the end, and takes 1 / tau of that from the average.
+        series = tau * (1 / 12 - tau * (1 / 24 - tau * (1 / 80 - tau * (1 / 360 - tau * (1 / 2016 - tau * (1 / 13440))))))
+        bend = jnp.where(thin, series, ((1 + transmittance) / 2 - mean) / jnp.maximum(tau, limit)) * source.rise
+        end, average = end + tau * bend, average - bend
+    return end, average
 
 
 def _cross(rays, chords: Chords, fields: _Fields, length, entering, track: _Track, fluence: bool, cut: bool):
@@ -438,9 +475,14 @@ def _cross(rays, chords: Chords, fields: _Fields, length, entering, track: _Trac
             rays, path = jnp.where(free.behind, emitted, rays), free.share
         else:
             free, path = None, share
-        end, mean = _attenuate(rays, fields, length[:, None, None] * path)
+        start = 0.0 if free is None else jnp.where(free.behind, share - path, 0.0)
+        source = _source(fields, chords, number, start, path)
+        end, mean = _attenuate(rays, fields, source, length[:, None, None] * path)
         rays = jnp.where(track.rim if free is None else free.arrives, emitted, end)
         if fluence:
+            if source is not None and source.rise is not None and fields.source is not None:
+                # The paths' middles are not all at the voxel's: what they are off counts as in linear light.
+                mean = mean - (source.middle - fields.source)
             passing = path * mean if passing is None else passing + path * mean
     return starts, rays, passing
 
@@ -463,7 +505,7 @@ class _TileRead(NamedTuple):
 def _read_tile(tile, reads: Reads, bits, own: Ordinates, chords: Chords, plane: _Fields, length, mean_of) -> _TileRead:
     """Weight * cosine * radiance of the elements of a tile, in the directions of `bits`."""
     cut = lambda a: lax.dynamic_slice_in_dim(a, tile * reads.tile, reads.tile, axis=-1)
-    cell, face = cut(reads.cell), tuple(cut(component) for component in reads.plane)
+    cell, face = cut(reads.cell), tuple(cut(component) for component in (*reads.plane, reads.height))
     word, bit = np.divmod(np.arange(own.weight.shape[0]), 32)
     chosen = ((cut(bits)[word] >> bit[:, None].astype(np.uint32)) & 1).astype(length.dtype)
     weight = own.weight[:, None] * jnp.maximum(-_along(own.direction, face), 0.0) * chosen
@@ -501,20 +543,36 @@ def _mean_of_hits(radiance, plane: _Fields, face, chords: Chords, length) -> Flo
     for number, ends in enumerate(chords.ends):
         share = chords.share[number][:, None, None]
         hit, part = _hit(face, ends, share)
-        end, _ = _attenuate(radiance[number], plane, length * share * part)
+        path = share * part
+        end, _ = _attenuate(radiance[number], plane, _source(plane, chords, number, 0.0, path), length * path)
         total, count = total + jnp.where(hit, end, 0.0), count + hit
     return total / jnp.maximum(count, 1)
 
 
 def _mean_of_paths(radiance, plane: _Fields, face, chords: Chords, length) -> Float[Array, "D C T"]:
-    """Mean radiance of the free paths in the voxel; 0 where there are none."""
+    """Mean radiance of the free paths in the voxel; 0 where there are none.
+
+    With `onward` carried on to the element's plane: in a thick medium it would be read half a voxel too deep.
+    """
     total = paths = 0.0
+    towards = -_height((0.0, *face[1:4]), chords.step)
+    # A step is as long as the rays' slant makes it.
+    spacing = length / jnp.sqrt(sum(x**2 for x in chords.step))[:, None, None]
     # Gathered once, not anew for every use.
     radiance, plane = lax.optimization_barrier((radiance, plane))
     facing = _facing(plane, chords)
     for number, ends in enumerate(chords.ends):
-        free = _free_part(facing, ends[0], chords.share[number][:, None, None])
-        _, mean = _attenuate(jnp.where(free.behind, plane.exitance, radiance[number]), plane, length * free.share)
+        share = chords.share[number][:, None, None]
+        free = _free_part(facing, ends[0], share)
+        start = jnp.where(free.behind, share - free.share, 0.0)
+        source = _source(plane, chords, number, start, free.share)
+        _, mean = _attenuate(jnp.where(free.behind, plane.exitance, radiance[number]), plane, source, length * free.share)
+        if plane.onward:
+            middle = start + free.share / 2
+            height = _height((face[4], *face[1:4]), ends[0]) - middle * towards
+            onward = jnp.clip(height / jnp.maximum(towards, 1e-6), 0.0, _ONWARD)
+            onward = onward * thickness(plane.extinction * spacing)
+            mean, _ = _attenuate(mean, plane, _source(plane, chords, number, middle, onward), length * onward)
         total, paths = total + free.share * mean, paths + free.share
     return jnp.where(paths > 1e-6, total / jnp.maximum(paths, 1e-6), 0.0)
 

@@ -18,6 +18,8 @@ Public: `transposed_sweep`, `adjoint_sweep`, `Adjoint`.
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -25,7 +27,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..layout import AxisReads, Layout, Ordinates
+from ..layout import AXES, AxisReads, Layout, Ordinates
 from .characteristic import (
     Inflow,
     SweptMedium,
@@ -49,6 +51,7 @@ class Adjoint(NamedTuple):
 
     exitance: Float[Array, "C E"]
     source: Float[Array, "C nx ny nz"] | None
+    slopes: tuple[Float[Array, "C X Y Z"], ...] | None
     extinction: Float[Array, "C X Y Z"] | None
     radiance: Float[Array, "images n C"] | None  # of the inflow
     factor: Float[Array, "C E"] | None
@@ -60,12 +63,20 @@ def transposed_sweep(
     at_elements: Float[Array, "C E"],
     in_voxels: Float[Array, "C nx ny nz"] | None,
     medium: SweptMedium | None = None,
+    slopes_of: Callable[[Array], tuple[Array, ...]] | None = None,
 ) -> tuple[Float[Array, "C E"], Float[Array, "C nx ny nz"] | None]:
     """The transpose of `sweep` in (exitance, medium.source), applied to weights of its two results.
 
-    <sweep(x), y> = <x, transposed_sweep(y)> to rounding. The source of `medium` is not looked at.
+    <sweep(x), y> = <x, transposed_sweep(y)> to rounding. The source of `medium` and its slopes are not looked at;
+    `slopes_of`, linear, makes them of the padded source where there are any.
     """
-    return adjoint_sweep(layout, ordinates, at_elements, in_voxels, None, medium)[:2]
+    if medium is not None:
+        dark = jnp.zeros((at_elements.shape[0], *layout.padded), at_elements.dtype)
+        medium = dataclasses.replace(medium, source=dark, slopes=None if slopes_of is None else (dark,) * 3)
+    found = adjoint_sweep(layout, ordinates, at_elements, in_voxels, None, medium)
+    if found.source is None or found.slopes is None or slopes_of is None:
+        return found.exitance, found.source
+    return found.exitance, found.source + layout.from_padded(jax.vjp(slopes_of, dark)[1](found.slopes)[0])
 
 
 def adjoint_sweep(
@@ -77,12 +88,13 @@ def adjoint_sweep(
     medium: SweptMedium | None = None,
     inflow: Inflow | None = None,
 ) -> Adjoint:
-    """The derivative of <weights, sweep(...)> in the exitance, the source and the light that enters.
+    """The derivative of <weights, sweep(...)> in the exitance, the source, its slopes if it has any, and the light that enters.
 
-    With `exitance` (what was sent), and `medium` as it was swept, also in the extinction and in the inflow's factor.
+    With `exitance` (what was sent), and `medium` as it was swept, also in the extinction and in the inflow's factor; the slopes
+    stand for themselves there.
     """
     bands, real = at_elements.shape[0], at_elements.dtype
-    whole = exitance is not None
+    whole, sloped = exitance is not None, medium is not None and medium.slopes is not None
     dark = jnp.zeros((bands, *layout.padded), real)
     sent = layout.exitance_field(exitance) if exitance is not None else dark
     asked = None if in_voxels is None else layout.to_padded(in_voxels)
@@ -95,11 +107,11 @@ def adjoint_sweep(
         rows = tuple(at_elements[:, r.element] for r in reads)
         entry = None if inflow is None else _Entry(images, inflow.radiance, planes(factor))
         back, light = _axis_adjoint(track, own, reads, rows, planes(asked), entry, whole)
-        back = [_on_axis(axis, lambda a, field=field: _from_planes(layout, a, field)) for field in back]
+        back = _on_axis(axis, lambda a: [_from_planes(layout, a, field) for field in _in_scene_order(back, a, sloped)])
         fields, total = sums
         return [t + f for t, f in zip(fields, back, strict=True)], None if light is None else total + light
 
-    number = 1 + (medium is not None) * (2 if whole else 1) + (whole and factor is not None)
+    number = 1 + (medium is not None) * (1 + 3 * sloped + whole) + (whole and factor is not None)
     sums = ([dark] * number, None if inflow is None else jnp.zeros_like(inflow.radiance))
     if layout.cubic:
         directions = jax.tree.map(lambda *a: jnp.stack(a), *ordinates)
@@ -109,15 +121,23 @@ def adjoint_sweep(
         for axis in range(3):
             sums = one_axis(axis, ordinates[axis], layout.reads[axis], sums)
     fields, radiance = list(sums[0]), sums[1]
-    at = lambda field: _at_elements(layout, field)
-    strength = at(fields.pop()) if whole and factor is not None else None
+    strength = _at_elements(layout, fields.pop()) if whole and factor is not None else None
+    curve = fields.pop() if whole and medium is not None else None
     return Adjoint(
-        exitance=at(fields[0]),
+        exitance=_at_elements(layout, fields[0]),
         source=None if medium is None else layout.from_padded(fields[1]),
-        extinction=fields[2] if whole and medium is not None else None,
+        slopes=tuple(fields[2:]) if sloped else None,
+        extinction=curve,
         radiance=radiance,
         factor=strength,
     )
+
+
+def _in_scene_order(fields: list[Array], axis: int, sloped: bool) -> list[Array]:
+    """Slopes along the sweep axis, u and v put in the order x, y, z; all else as it is."""
+    if not sloped:
+        return fields
+    return [*fields[:2], *(fields[2 + AXES[axis].index(a)] for a in range(3)), *fields[5:]]
 
 
 def _at_elements(layout: Layout, field: Float[Array, "C X Y Z"]) -> Float[Array, "C E"]:
@@ -135,21 +155,23 @@ class _Entry(NamedTuple):
 
 
 def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, wanted, entry: _Entry | None, whole: bool):
-    """Derivatives in planes [K, C, P] (exitance, source, extinction, factor) and in the radiance, of all chunks of one axis."""
+    """Derivatives in planes [K, C, P] and in the radiance, of all chunks of one axis.
+
+    The planes are of exitance, source, slopes, extinction and factor.
+    """
     fields = track.fields
     bands, real = fields.exitance.shape[1], fields.exitance.dtype
     fluence = wanted is not None
     zero_row = jnp.zeros((bands, track.area), real)
     has_medium = fields.extinction is not None
-    kinds = (1 + (2 if whole else 1)) if has_medium else 1
+    kinds = len(fields.sent) + (has_medium and whole)
     has_factor = whole and entry is not None and entry.strength is not None
 
     def sent_row(number):
         """What the derivative is taken at."""
         if not whole:
             return (zero_row,) * kinds
-        assert not has_medium or fields.source is not None
-        full = (fields.exitance, fields.source, fields.extinction) if has_medium else (fields.exitance,)
+        full = fields.sent if fields.extinction is None else (*fields.sent, fields.extinction)
         return tuple(_row(f, number) for f in full)
 
     def add(planes, number, rows):

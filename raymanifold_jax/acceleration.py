@@ -1,0 +1,259 @@
+"""Diffusion as a preconditioner: what light does over many bounces, without a sweep.
+
+Where light bounces hundreds of times it spreads as heat does. With J the mean radiance in a voxel, g = 4 pi extinction V the
+power it takes up for J = 1, R its scattering albedo, and f the light that leaves it,
+
+    g (1 - R) J + sum over neighbours k (J - J') = g f,        k = 4 pi h^2 (1 / (3 h / l) + 1/4),
+
+with l the mean free path. The first term of k is the diffusion of radiance; the second is what the sweep itself does in thick
+voxels, where each radiates with one source (fitted to it: the solve would not converge otherwise). Surfaces hang on their
+probe voxels by Marshak's condition, 2 pi A (J - B), and end free paths too (the Knudsen regime of gases), so that the same
+equation serves in vacuum. It is symmetric, with seven points, and solved by conjugate gradients and multigrid, at a few
+percent of a sweep's time. With A that matrix,
+
+    (I - K)^-1 = I + (I - K)^-1 K   is nearly   M = I + R A^-1 g,
+
+and GMRES on (I - K) M needs about as many sweeps for albedo 0.9999 as for 0.9, in thin media as in thick ones (diffusion
+synthetic acceleration as a preconditioner: Warsa, Wareing & Morel, Nucl. Sci. Eng. 147, 2004).
+
+Public: `Diffusion`, `make_diffusion`.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from .operator import Light, Materials, Transport
+from .surfaces import Surfaces
+
+_FREE_PATH = 4.0  # times the distance to the nearest surface, where nothing else ends a path
+_ENOUGH = 0.05  # of the residual may be left: GMRES corrects the rest
+_MOST = 30  # steps of conjugate gradients
+_DAMPING = 0.8  # of Jacobi's smoothing
+_SMOOTHINGS = 2  # before and after a coarser level
+
+
+class _Level(NamedTuple):
+    """A seven-point matrix: conductance from each voxel to the next along each axis (the last: to the first), and the rest."""
+
+    links: tuple[Array, Array, Array]  # [C, nx, ny, nz] each
+    loss: Array  # what a voxel absorbs, for J = 1
+    smoothing: Array  # the damping over the diagonal
+
+    def apply(self, field: Array) -> Array:
+        total = self.loss * field
+        for axis, link in enumerate(self.links, start=1):
+            flow = link * (field - jnp.roll(field, -1, axis))
+            total = total + flow - jnp.roll(flow, 1, axis)
+        return total
+
+
+def _level(links: list[Array], loss: Array) -> _Level:
+    diagonal = sum((link + jnp.roll(link, 1, axis) for axis, link in enumerate(links, start=1)), start=loss)
+    return _Level((links[0], links[1], links[2]), loss, _DAMPING / diagonal)
+
+
+class Diffusion(eqx.Module):
+    """M of the module's docstring, for one scene and its albedos."""
+
+    levels: tuple[_Level, ...]
+    power: Light  # g
+    albedo: Light  # R
+    probe: Int[Array, " E"]  # the voxel each element hangs on, flat
+    coupling: Float[Array, "C E"]  # k
+
+    def __call__(self, leaving: Light) -> Light:
+        """M applied to what leaves: about the solution of (I - K) x = leaving."""
+        return _precondition(self, leaving)
+
+    def transposed(self, light: Light) -> Light:
+        """M' = I + g A^-1 R."""
+        return _transposed(self, light)
+
+    def of_arriving(self, light: Light) -> Light:
+        """The same where bounces take arriving light to arriving light: I + A^-1 g R."""
+        return _of_arriving(self, light)
+
+    def of_arriving_transposed(self, light: Light) -> Light:
+        """I + R g A^-1."""
+        return _of_arriving_transposed(self, light)
+
+
+@eqx.filter_jit
+def _precondition(near: Diffusion, leaving: Light) -> Light:
+    weighted = jax.tree.map(jnp.multiply, near.power, leaving)
+    return leaving + jax.tree.map(jnp.multiply, near.albedo, _spread(near, weighted))
+
+
+@eqx.filter_jit
+def _transposed(near: Diffusion, light: Light) -> Light:
+    weighted = jax.tree.map(jnp.multiply, near.albedo, light)
+    return light + jax.tree.map(jnp.multiply, near.power, _spread(near, weighted))
+
+
+@eqx.filter_jit
+def _of_arriving(near: Diffusion, light: Light) -> Light:
+    return light + _spread(near, jax.tree.map(lambda g, r, x: g * r * x, near.power, near.albedo, light))
+
+
+@eqx.filter_jit
+def _of_arriving_transposed(near: Diffusion, light: Light) -> Light:
+    return light + jax.tree.map(lambda g, r, x: g * r * x, near.power, near.albedo, _spread(near, light))
+
+
+def _spread(near: Diffusion, sent: Light) -> Light:
+    """A^-1 applied to powers: elements are eliminated, the voxels solved for."""
+    shape = near.levels[0].loss.shape
+    albedo, power = near.albedo.elements, near.power.elements
+    whole = power * (1 - albedo) + near.coupling * albedo
+    passed = near.coupling * albedo / whole
+    into = jnp.zeros((shape[0], math.prod(shape[1:])), power.dtype).at[:, near.probe].add(passed * sent.elements)
+    into = into.reshape(shape)
+    voxels = _conjugate_gradients(near.levels, into if sent.voxels is None else into + sent.voxels)
+    above = voxels.reshape(shape[0], -1)[:, near.probe]
+    return Light((sent.elements + near.coupling * above) / whole, None if sent.voxels is None else voxels)
+
+
+def _conjugate_gradients(levels: tuple[_Level, ...], right: Array) -> Array:
+    dot = lambda a, b: jnp.sum(a * b, axis=(1, 2, 3), keepdims=True)
+    ratio = lambda a, b: jnp.where(b > 0, a / jnp.where(b > 0, b, 1.0), 0.0)
+
+    def step(state):
+        count, field, residual, direction, length = state
+        image = levels[0].apply(direction)
+        move = ratio(length, dot(direction, image))
+        field, residual = field + move * direction, residual - move * image
+        better = _cycle(levels, residual)
+        new = dot(residual, better)
+        return count + 1, field, residual, better + ratio(new, length) * direction, new
+
+    first = _cycle(levels, right)
+    begun = dot(right, first)
+    going = lambda state: (state[0] < _MOST) & jnp.any(state[4] > _ENOUGH**2 * begun)
+    return lax.while_loop(going, step, (0, jnp.zeros_like(right), right, first, begun))[1]
+
+
+def _cycle(levels: tuple[_Level, ...], right: Array) -> Array:
+    """One V-cycle: smoothing, the same on a lattice of half the size, smoothing. Symmetric."""
+    level, coarser = levels[0], levels[1:]
+
+    def smoothed(field):
+        # In a loop, because XLA otherwise works a step out again for each of the points that the next step reads.
+        step = lambda _, field: field + level.smoothing * (right - level.apply(field))
+        return lax.fori_loop(0, _SMOOTHINGS, step, field)
+
+    field = smoothed(jnp.zeros_like(right))
+    if not coarser:
+        return smoothed(field)
+    left = lax.optimization_barrier(right - level.apply(field))
+    field = field + _refine(_cycle(coarser, lax.optimization_barrier(_coarsen(left))), right.shape)
+    return smoothed(lax.optimization_barrier(field))
+
+
+def _pairs(field: Array, axis: int) -> Array:
+    """Sums of neighbours two by two along an axis; one that is left over stays as it is."""
+    size = field.shape[axis]
+    if size % 2:
+        field = jnp.pad(field, [(0, int(a == axis)) for a in range(field.ndim)])
+    return field.reshape(*field.shape[:axis], (size + 1) // 2, 2, *field.shape[axis + 1 :]).sum(axis + 1)
+
+
+def _coarsen(field: Array) -> Array:
+    """Sums of eight neighbours."""
+    bands, *size = field.shape
+    field = jnp.pad(field, [(0, 0), *((0, n % 2) for n in size)])
+    halves = [m for n in size for m in (-(-n // 2), 2)]
+    return field.reshape(bands, *halves).sum((2, 4, 6))
+
+
+def _refine(field: Array, shape: tuple[int, ...]) -> Array:
+    """The transpose of `_coarsen`."""
+    bands, *size = field.shape
+    doubled = [m for n in size for m in (n, 2)]
+    spread = jnp.broadcast_to(field.reshape(bands, *(m for n in size for m in (n, 1))), (bands, *doubled))
+    return spread.reshape(bands, *(2 * n for n in size))[tuple(slice(n) for n in shape)]
+
+
+def _coarse_level(level: _Level) -> _Level:
+    links = []
+    for axis, link in enumerate(level.links, start=1):
+        size = link.shape[axis]
+        last = lax.slice_in_dim(link, size - 1, size, axis=axis)
+        outer = lax.slice_in_dim(link, 1, size, stride=2, axis=axis)
+        link = jnp.concatenate([outer, last], axis) if size % 2 else outer
+        for other in {1, 2, 3} - {axis}:
+            link = _pairs(link, other)
+        links.append(link / 2)  # twice as far
+    return _level(links, _coarsen(level.loss))
+
+
+def make_diffusion(transport: Transport, surfaces: Surfaces, stuff: Materials) -> Diffusion:
+    """The preconditioner of a scene on its lattice."""
+    layout = transport.layout
+    weights = sum(jnp.sum(o.weight) for o in transport.ordinates) * len(layout.unfolding.images())
+    free = np.clip(np.asarray(transport.coverage / weights), 0.0, 1.0)
+    ends = _distance(free == 0, surfaces, layout.shape)
+    periodic = [a for a in range(3) if layout.pad[a] == 0 and a not in layout.unfolding.axes]
+    probe = np.where([a in periodic for a in range(3)], surfaces.probe % layout.shape, surfaces.probe)
+    probe = np.clip(probe, 0, np.array(layout.shape) - 1)
+    flat = np.asarray(np.ravel_multi_index(tuple(probe.T), layout.shape)) if len(probe) else np.zeros(0, int)
+    area = surfaces.area / layout.spacing**2  # powers are in units of a voxel's face
+    return _assemble(
+        stuff, jnp.asarray(free), jnp.asarray(1 / (_FREE_PATH * ends)), jnp.asarray(area), jnp.asarray(flat, np.int32),
+        layout.spacing, tuple(a in periodic for a in range(3)),
+    )  # fmt: skip
+
+
+def _distance(solid: np.ndarray, surfaces: Surfaces, shape: tuple[int, int, int]) -> np.ndarray:
+    """From each voxel to the nearest surface, in voxels, along the axes (at least 1/2)."""
+    distance = np.where(solid, 0.0, float(sum(shape)))
+    distance[tuple(np.clip(surfaces.probe, 0, np.array(shape) - 1).T)] = 0.5
+    for axis in range(3):
+        steps = np.arange(shape[axis]).reshape([-1 if a == axis else 1 for a in range(3)])
+        for flipped in (False, True):
+            turned = np.flip(distance, axis) if flipped else distance
+            turned = np.minimum.accumulate(turned - steps, axis) + steps
+            distance = np.flip(turned, axis) if flipped else turned
+    return np.maximum(distance, 0.5)
+
+
+@eqx.filter_jit
+def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodic: tuple[bool, ...]) -> Diffusion:
+    real, bands = stuff.albedo.dtype, stuff.albedo.shape[0]
+    free, ends, area = (x.astype(real) for x in (free, ends, area))
+    extinction = 0.0 if stuff.extinction is None else stuff.extinction * spacing
+    depth = jnp.broadcast_to(extinction, (bands, *free.shape)).astype(real)
+    power = 4 * jnp.pi * depth * free
+    scattering = jnp.zeros_like(depth) if stuff.scattering_albedo is None else stuff.scattering_albedo
+    total = depth + ends
+    links = []
+    for axis in (1, 2, 3):
+        next_to = lambda field, axis=axis: jnp.roll(field, -1, axis)
+        open_part = jnp.minimum(free, jnp.roll(free, -1, axis - 1))
+        link = 4 * jnp.pi * open_part * (2 / (3 * (total + next_to(total))) + 1 / 4)
+        if not periodic[axis - 1]:
+            size = link.shape[axis]
+            inside = jnp.arange(size).reshape([-1 if a == axis else 1 for a in range(4)]) < size - 1
+            link = jnp.where(inside, link, 0.0)
+        links.append(link)
+    of_elements = jnp.broadcast_to(jnp.pi * area, stuff.albedo.shape)
+    coupling = 2 * of_elements / (1 + jnp.minimum(depth.reshape(bands, -1)[:, probe], 1.0))
+    whole = of_elements * (1 - stuff.albedo) + coupling * stuff.albedo
+    taken = coupling * of_elements * (1 - stuff.albedo) / whole
+    loss = (power * (1 - scattering)).reshape(bands, -1).at[:, probe].add(taken).reshape(depth.shape)
+    # Nothing happens in voxels inside solids; and a matrix that nearly is singular must not be.
+    links_of = sum((link + jnp.roll(link, 1, axis) for axis, link in enumerate(links, start=1)), start=jnp.zeros_like(loss))
+    loss = jnp.where(links_of + loss > 0, loss + 8 * jnp.finfo(real).eps * links_of, 1.0)
+    levels = [_level(links, loss)]
+    while max(levels[-1].loss.shape[1:]) > 2:
+        levels.append(_coarse_level(levels[-1]))
+    voxels = None if stuff.scattering_albedo is None else power
+    return Diffusion(tuple(levels), Light(of_elements, voxels), Light(stuff.albedo, stuff.scattering_albedo), probe, coupling)

@@ -1,0 +1,137 @@
+"""GMRES on (I - K) x = b, one application of K a step, and arithmetic of light.
+
+With the residual r of the guess, the basis v_0 = r / |r|, v_1, ... is orthonormal, and step k sends z_k = M v_k through K:
+
+    (I - K) z_k = v_0 h_0k + ... + v_{k+1} h_{k+1,k},       x = sum y_k z_k,       |r - (I - K) x| as small as can be.
+
+M, the preconditioner, may change from step to step (flexible GMRES: Saad, SIAM J. Sci. Comput. 14, 1993). What is kept of
+each step is the caller's choice: z_k, or what of it arrives. The numbers h are worked with in float64 on the host.
+
+Public: `Subspace`, `linear_solve`, `combine`, `dot`, `norm`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .operator import Light
+
+_INDEPENDENT = 1e-6  # of the first residual: less than this of a new direction is rounding
+
+
+class Subspace:
+    """What GMRES knows after some steps from a residual `start`.
+
+    `apply(z)` returns (what to keep of z, K z). `residual` is what is left of `start`; `gain()` the same combination of what
+    was kept as x is of the z; `exhausted`: no further step can help.
+    """
+
+    def __init__(self, apply: Callable[[Light], tuple[Light, Light]], start: Light, size: int, precondition: Callable):
+        self._apply, self._precondition = apply, precondition
+        self._length = float(norm(start))
+        empty = jax.tree.map(jnp.zeros_like, start)
+        self._basis = [combine([1 / self._length], [start])] + [empty] * size
+        self._kept: list[Light] = []
+        self._steps = 0
+        self._hessenberg = np.zeros((size + 1, size))
+        self._weights = np.zeros(0)
+        self.residual, self.exhausted = start, False
+
+    def step(self) -> None:
+        k, size = self._steps, len(self._basis) - 1
+        sent = self._precondition(self._basis[k])
+        kept, passed = self._apply(sent)
+        if not self._kept:  # always as many, so that one program adds them up
+            self._kept = [jax.tree.map(jnp.zeros_like, kept)] * size
+        self._kept[k] = kept
+        self._steps += 1
+        self._basis[k + 1], column = _arnoldi(tuple(self._basis), sent, passed)
+        hessenberg, column = self._hessenberg, np.asarray(column, np.float64)
+        hessenberg[:, k] = column[: len(hessenberg)]
+        hessenberg[k + 1, k] = column[-1]
+        small = hessenberg[: k + 2, : k + 1]
+        right = np.zeros(k + 2)
+        right[0] = self._length
+        weights = np.linalg.lstsq(small, right, rcond=None)[0]
+        left = np.zeros(size + 1)
+        left[: k + 2] = right - small @ weights
+        self._weights = np.append(weights, np.zeros(size - k - 1))
+        self.residual = combine(left, self._basis)
+        self.exhausted = k + 1 == size or hessenberg[k + 1, k] <= _INDEPENDENT * abs(hessenberg[: k + 1, k]).max()
+
+    def gain(self) -> Light:
+        return combine(self._weights, self._kept)
+
+
+def linear_solve(
+    apply: Callable[[Light], Light],
+    right: Light,
+    precondition: Callable[[Light], Light] = lambda light: light,
+    good: Callable[[Light], bool] | None = None,
+    most: int = 200,
+    restart: int = 12,
+) -> tuple[Light, Light, int]:
+    """Solve (I - K) x = right for any linear `apply`, K or its transpose, with light of any sign.
+
+    `good(residual)` says when to stop, by default below 1e-5 of `right` in the 2-norm; `most` is the most applications.
+    Returns x, the residual, and how many times K was applied.
+    """
+    target = 1e-5 * float(norm(right))
+    good = (lambda residual: float(norm(residual)) <= target) if good is None else good
+    solution, residual, count = jax.tree.map(jnp.zeros_like, right), right, 0
+    while count < most and not good(residual):
+        space = Subspace(lambda sent: (sent, apply(sent)), residual, restart, precondition)
+        while True:
+            space.step()
+            count += 1
+            if space.exhausted or count >= most or good(space.residual):
+                break
+        solution, residual = solution + space.gain(), space.residual
+    return solution, residual, count
+
+
+@eqx.filter_jit
+def _arnoldi(basis: tuple[Light, ...], sent: Light, passed: Light) -> tuple[Light, Array]:
+    """The next basis vector: (I - K) sent, made orthogonal to the basis; `passed` is K sent. Unused vectors are 0."""
+    vector = jax.tree.map(jnp.subtract, sent, passed)
+    column = jnp.zeros(len(basis), sent.elements.dtype)
+    for _ in range(2):  # twice is enough, in float32 too
+        overlap = jnp.stack([dot(b, vector) for b in basis])
+        for k, b in enumerate(basis):
+            vector = jax.tree.map(lambda v, x, k=k, overlap=overlap: v - overlap[k] * x, vector, b)
+        column = column + overlap
+    length = norm(vector)
+    scale = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)
+    return jax.tree.map(lambda v: v * scale, vector), jnp.append(column, length)
+
+
+def dot(a: Light, b: Light) -> Array:
+    return sum(jax.tree.leaves(jax.tree.map(lambda x, y: jnp.sum(x * y), a, b)), start=jnp.zeros((), a.elements.dtype))
+
+
+@eqx.filter_jit
+def norm(light: Light) -> Array:
+    """The 2-norm, with squares that neither overflow nor vanish."""
+    scale = jnp.maximum(light.largest(), jnp.finfo(light.elements.dtype).tiny)
+    scaled = jax.tree.map(lambda x: x / scale, light)
+    return scale * jnp.sqrt(dot(scaled, scaled))
+
+
+@eqx.filter_jit
+def _sum(weights: tuple[Array, ...], fields: tuple[Light, ...]) -> Light:
+    total = jax.tree.map(lambda x: weights[0] * x, fields[0])
+    for weight, field in zip(weights[1:], fields[1:], strict=True):
+        total = jax.tree.map(lambda t, x, weight=weight: t + weight * x, total, field)
+    return total
+
+
+def combine(weights, fields: list[Light]) -> Light:
+    """The sum of `fields`, each times its weight."""
+    real = fields[0].elements.dtype
+    return _sum(tuple(jnp.asarray(w, real) for w in weights), tuple(fields))
