@@ -54,6 +54,8 @@ _MODULE_OF = {
     "OptimistixFixedPoint": "optimistix_solver",
     "Solution": "solution",
     "solve": "solve",
+    "ErrorEstimate": "error_estimate",
+    "estimate_error": "error_estimate",
     "fluence": "gather",
     "irradiance": "gather",
     "outgoing_flux": "gather",
@@ -76,6 +78,8 @@ if TYPE_CHECKING:
     from raymanifold_jax.checkpoint import Checkpoint as Checkpoint
     from raymanifold_jax.cost import CostReport as CostReport
     from raymanifold_jax.cost import cost_report as cost_report
+    from raymanifold_jax.error_estimate import ErrorEstimate as ErrorEstimate
+    from raymanifold_jax.error_estimate import estimate_error as estimate_error
     from raymanifold_jax.fit import Fit as Fit
     from raymanifold_jax.fit import Parameter as Parameter
     from raymanifold_jax.fit import fit as fit

@@ -6,7 +6,10 @@ power it takes up for J = 1, R its scattering albedo, and f the light that leave
     g (1 - R) J + sum over neighbours k (J - J') = g f,        k = 4 pi h^2 (1 / (3 h / l) + 1/4),
 
 with l the mean free path. The first term of k is the diffusion of radiance; the second is what the sweep itself does in thick
-voxels, where each radiates with one source (fitted to it: the solve would not converge otherwise). Surfaces hang on their
+voxels that radiate with one source each (the solve would not converge otherwise). Where sources have slopes (see
+`transport.slopes`), light passes between voxels by their third differences instead: with L the sum of differences to
+neighbours, 4 pi h^2 L / (3 h / l) becomes that times (1 + 3 h / (16 l) L), and solving takes a second step, (1 + ...)^-1.
+Both together are what the sweep does to waves of any length. Surfaces hang on their
 probe voxels by Marshak's condition, 2 pi A (J - B), and end free paths too (the Knudsen regime of gases), so that the same
 equation serves in vacuum. It is symmetric, with seven points, and solved by conjugate gradients and multigrid, at a few
 percent of a sweep's time. With A that matrix,
@@ -33,6 +36,7 @@ from jaxtyping import Array, Float, Int
 
 from .operator import Light, Materials, Transport
 from .surfaces import Surfaces
+from .transport.slopes import flattening
 
 _FREE_PATH = 4.0  # times the distance to the nearest surface, where nothing else ends a path
 _ENOUGH = 0.05  # of the residual may be left: GMRES corrects the rest
@@ -65,10 +69,13 @@ class Diffusion(eqx.Module):
     """M of the module's docstring, for one scene and its albedos."""
 
     levels: tuple[_Level, ...]
+    sloped: tuple[_Level, ...] | None  # of the second step
+    weight: Float[Array, "C nx ny nz"]  # what a voxel keeps in it
     power: Light  # g
     albedo: Light  # R
     probe: Int[Array, " E"]  # the voxel each element hangs on, flat
     coupling: Float[Array, "C E"]  # k
+    bend: Float[Array, "C E"]  # the same in the second step
 
     def __call__(self, leaving: Light) -> Light:
         """M applied to what leaves: about the solution of (I - K) x = leaving."""
@@ -83,7 +90,7 @@ class Diffusion(eqx.Module):
         return _of_arriving(self, light)
 
     def of_arriving_transposed(self, light: Light) -> Light:
-        """I + R g A^-1."""
+        """Its transpose: I + R g A^-1, both steps in turn."""
         return _of_arriving_transposed(self, light)
 
 
@@ -96,7 +103,7 @@ def _precondition(near: Diffusion, leaving: Light) -> Light:
 @eqx.filter_jit
 def _transposed(near: Diffusion, light: Light) -> Light:
     weighted = jax.tree.map(jnp.multiply, near.albedo, light)
-    return light + jax.tree.map(jnp.multiply, near.power, _spread(near, weighted))
+    return light + jax.tree.map(jnp.multiply, near.power, _spread_transposed(near, weighted))
 
 
 @eqx.filter_jit
@@ -106,20 +113,51 @@ def _of_arriving(near: Diffusion, light: Light) -> Light:
 
 @eqx.filter_jit
 def _of_arriving_transposed(near: Diffusion, light: Light) -> Light:
-    return light + jax.tree.map(lambda g, r, x: g * r * x, near.power, near.albedo, _spread(near, light))
+    spread = _spread_transposed(near, light)
+    return light + jax.tree.map(lambda g, r, x: g * r * x, near.power, near.albedo, spread)
 
 
 def _spread(near: Diffusion, sent: Light) -> Light:
     """A^-1 applied to powers: elements are eliminated, the voxels solved for."""
-    shape = near.levels[0].loss.shape
+    whole, passed = _elimination(near)
+    into = _gathered(near, passed * sent.elements)
+    voxels = _conjugate_gradients(near.levels, into if sent.voxels is None else into + sent.voxels)
+    elements = (sent.elements + near.coupling * _above(near, voxels)) / whole
+    if near.sloped is not None:
+        beside = _gathered(near, near.bend * near.albedo.elements * elements)
+        voxels = _conjugate_gradients(near.sloped, near.weight * voxels + beside)
+    return Light(elements, None if sent.voxels is None else voxels)
+
+
+def _spread_transposed(near: Diffusion, asked: Light) -> Light:
+    """The transpose of `_spread`."""
+    whole, passed = _elimination(near)
+    elements = asked.elements
+    voxels = jnp.zeros_like(near.levels[0].loss) if asked.voxels is None else asked.voxels
+    if near.sloped is not None:
+        smooth = _conjugate_gradients(near.sloped, voxels)
+        voxels = near.weight * smooth
+        elements = elements + near.bend * near.albedo.elements * _above(near, smooth)
+    elements = elements / whole
+    voxels = _conjugate_gradients(near.levels, voxels + _gathered(near, near.coupling * elements))
+    return Light(elements + passed * _above(near, voxels), None if asked.voxels is None else voxels)
+
+
+def _elimination(near: Diffusion) -> tuple[Array, Array]:
     albedo, power = near.albedo.elements, near.power.elements
     whole = power * (1 - albedo) + near.coupling * albedo
-    passed = near.coupling * albedo / whole
-    into = jnp.zeros((shape[0], math.prod(shape[1:])), power.dtype).at[:, near.probe].add(passed * sent.elements)
-    into = into.reshape(shape)
-    voxels = _conjugate_gradients(near.levels, into if sent.voxels is None else into + sent.voxels)
-    above = voxels.reshape(shape[0], -1)[:, near.probe]
-    return Light((sent.elements + near.coupling * above) / whole, None if sent.voxels is None else voxels)
+    return whole, near.coupling * albedo / whole
+
+
+def _above(near: Diffusion, voxels: Array) -> Array:
+    """Values of voxels at the elements that hang on them."""
+    return voxels.reshape(len(voxels), -1)[:, near.probe]
+
+
+def _gathered(near: Diffusion, elements: Array) -> Array:
+    """In each voxel the sum over the elements that hang on it."""
+    shape = near.levels[0].loss.shape
+    return jnp.zeros((shape[0], math.prod(shape[1:])), elements.dtype).at[:, near.probe].add(elements).reshape(shape)
 
 
 def _conjugate_gradients(levels: tuple[_Level, ...], right: Array) -> Array:
@@ -208,7 +246,7 @@ def make_diffusion(transport: Transport, surfaces: Surfaces, stuff: Materials) -
     area = surfaces.area / layout.spacing**2  # powers are in units of a voxel's face
     return _assemble(
         stuff, jnp.asarray(free), jnp.asarray(1 / (_FREE_PATH * ends)), jnp.asarray(area), jnp.asarray(flat, np.int32),
-        layout.spacing, tuple(a in periodic for a in range(3)),
+        layout.spacing, tuple(a in periodic for a in range(3)), transport.albedo is not None,
     )  # fmt: skip
 
 
@@ -226,7 +264,9 @@ def _distance(solid: np.ndarray, surfaces: Surfaces, shape: tuple[int, int, int]
 
 
 @eqx.filter_jit
-def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodic: tuple[bool, ...]) -> Diffusion:
+def _assemble(
+    stuff: Materials, free, ends, area, probe, spacing: float, periodic: tuple[bool, ...], sloped: bool
+) -> Diffusion:
     real, bands = stuff.albedo.dtype, stuff.albedo.shape[0]
     free, ends, area = (x.astype(real) for x in (free, ends, area))
     extinction = 0.0 if stuff.extinction is None else stuff.extinction * spacing
@@ -234,26 +274,43 @@ def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodi
     power = 4 * jnp.pi * depth * free
     scattering = jnp.zeros_like(depth) if stuff.scattering_albedo is None else stuff.scattering_albedo
     total = depth + ends
-    links = []
+    straight = jnp.zeros_like(depth)
+    if sloped:
+        straight = jnp.where((scattering > 0) & (free == 1), flattening(depth, scattering), 0.0)
+    links, bends = [], []
     for axis in (1, 2, 3):
         next_to = lambda field, axis=axis: jnp.roll(field, -1, axis)
-        open_part = jnp.minimum(free, jnp.roll(free, -1, axis - 1))
-        link = 4 * jnp.pi * open_part * (2 / (3 * (total + next_to(total))) + 1 / 4)
-        if not periodic[axis - 1]:
-            size = link.shape[axis]
-            inside = jnp.arange(size).reshape([-1 if a == axis else 1 for a in range(4)]) < size - 1
-            link = jnp.where(inside, link, 0.0)
-        links.append(link)
+        size = depth.shape[axis]
+        inside = jnp.arange(size).reshape([-1 if a == axis else 1 for a in range(4)]) < size - (not periodic[axis - 1])
+        open_part = jnp.where(inside, jnp.minimum(free, jnp.roll(free, -1, axis - 1)), 0.0)
+        bend = jnp.minimum(straight, next_to(straight))
+        links.append(4 * jnp.pi * open_part * (2 / (3 * (total + next_to(total))) + (1 - bend) / 4))
+        bends.append(open_part * bend)
     of_elements = jnp.broadcast_to(jnp.pi * area, stuff.albedo.shape)
-    coupling = 2 * of_elements / (1 + jnp.minimum(depth.reshape(bands, -1)[:, probe], 1.0))
+    at_probe = lambda field: field.reshape(bands, -1)[:, probe]
+    deep, bend = at_probe(depth), at_probe(straight)
+    coupling = 2 * of_elements / (1 + jnp.minimum(deep, 1.0))
+    beside = 2 / jnp.pi * of_elements * bend  # half as far as to the next voxel
     whole = of_elements * (1 - stuff.albedo) + coupling * stuff.albedo
     taken = coupling * of_elements * (1 - stuff.albedo) / whole
     loss = (power * (1 - scattering)).reshape(bands, -1).at[:, probe].add(taken).reshape(depth.shape)
     # Nothing happens in voxels inside solids; and a matrix that nearly is singular must not be.
     links_of = sum((link + jnp.roll(link, 1, axis) for axis, link in enumerate(links, start=1)), start=jnp.zeros_like(loss))
     loss = jnp.where(links_of + loss > 0, loss + 8 * jnp.finfo(real).eps * links_of, 1.0)
+    weight, second = 16 * (1 / (3 * total) + (1 - straight) / 4), None
+    if sloped:
+        held = weight.reshape(bands, -1).at[:, probe].add(beside).reshape(depth.shape)
+        second = _levels(bends, held)
+    voxels = None if stuff.scattering_albedo is None else power
+    return Diffusion(
+        _levels(links, loss), second, weight,
+        Light(of_elements, voxels), Light(stuff.albedo, stuff.scattering_albedo), probe, coupling, beside,
+    )  # fmt: skip
+
+
+def _levels(links: list[Array], loss: Array) -> tuple[_Level, ...]:
+    """The matrix on the lattice, and on coarser ones down to two voxels."""
     levels = [_level(links, loss)]
     while max(levels[-1].loss.shape[1:]) > 2:
         levels.append(_coarse_level(levels[-1]))
-    voxels = None if stuff.scattering_albedo is None else power
-    return Diffusion(tuple(levels), Light(of_elements, voxels), Light(stuff.albedo, stuff.scattering_albedo), probe, coupling)
+    return tuple(levels)

@@ -102,13 +102,18 @@ def _part(axes: tuple[Axis, ...], emission: np.ndarray, box: tuple[slice, ...], 
     # Two blocks along the whole of it, of which one is an image's where it touches a mirror.
     side = max(whole) / 2
     number = [max(1, round(blocks * (b - a) / side)) for a, b in ends]
-    cuts = [np.unique(np.linspace(a, b, n + 1).round().astype(int)) for n, (a, b) in zip(number, ends, strict=True)]
+    fine = max(math.ceil(n / (b - a)) for n, (a, b) in zip(number, ends, strict=True))  # voxels are cut where blocks are smaller
+    inside = emission[(slice(None), *box)]
+    for axis in range(3):
+        inside = inside.repeat(fine, axis + 1)
+    cuts = [np.unique(np.linspace(0, fine * (b - a), n + 1).round().astype(int)) for n, (a, b) in zip(number, ends, strict=True)]
+    lowest = np.array([a for a, _ in ends])
     points, power = [], []
     for corner in itertools.product(*(range(len(c) - 1) for c in cuts)):
         block = tuple(slice(c[i], c[i + 1]) for c, i in zip(cuts, corner, strict=True))
-        found = _block_points(emission[(slice(None), *block)], block)
-        points.append(found[0])
-        power.append(found[1])
+        found = _block_points(inside[(slice(None), *block)], block)
+        points.append(lowest + found[0] / fine)
+        power.append(found[1] / fine**3)
     position, strength = np.concatenate(points), np.concatenate(power, -1)
     lower, upper = (np.array([e[i] for e in ends], float)[None] for i in range(2))
     for axis, mirror in enumerate(mirrors):

@@ -10,6 +10,7 @@ from raymanifold_jax.layout import make_layout
 from raymanifold_jax.operator import Light, make_transport, materials
 from raymanifold_jax.surfaces import find_surfaces
 from raymanifold_jax.transport.characteristic import SweptMedium, sweep
+from raymanifold_jax.transport.slopes import source_slopes
 from raymanifold_jax.transport.transpose import transposed_sweep
 
 WALL = rm.Wall(0.5)
@@ -48,6 +49,39 @@ def test_transpose_is_the_adjoint(sides, medium):
         sent, emitted = jax.jit(lambda: transposed_sweep(layout, transport.ordinates, y, wanted, fog))()
         right = jnp.sum(sent * x) + (jnp.sum(emitted * source) if medium else 0.0)
         np.testing.assert_allclose(jnp.sum(elements * y) + jnp.sum(voxels * wanted), right, rtol=1e-13)
+
+
+@pytest.mark.slow
+def test_transpose_with_slopes_is_the_adjoint():
+    # As above where voxels are thick: scattered light is linear in them, and what is read is carried on to the surfaces.
+    with jax.enable_x64(True):
+        scene = rm.Scene(rm.Lattice((5, 4, 6)), medium=rm.Medium(0.6, 0.01), boundary=SIDES["periodic"][0])
+        surfaces = find_surfaces(scene)
+        layout, stuff = make_layout(scene, surfaces), materials(scene, surfaces)
+        transport = make_transport(layout, rm.quadrature.fibonacci(24), stuff.extinction, 1, albedo=stuff.scattering_albedo)
+        assert transport.albedo is not None and transport.onward and transport.extinction is not None
+        albedo, extinction = layout.to_padded(transport.albedo), transport.extinction
+        slopes_of = lambda source: source_slopes(layout, source, albedo, extinction)
+        random = lambda *shape: jnp.asarray(np.random.default_rng(len(shape)).random((1, *shape)))
+        x, source = random(len(surfaces)), random(*layout.shape)
+        y, wanted = 1 - x**2, 1 - source**2
+        padded = layout.to_padded(source)
+        fog = SweptMedium(extinction, padded, False, slopes_of(padded), True)
+        elements, voxels = jax.jit(lambda: sweep(layout, transport.ordinates, x, fog, None, True))()
+        sent, emitted = jax.jit(lambda: transposed_sweep(layout, transport.ordinates, y, wanted, fog, slopes_of))()
+        left = jnp.sum(elements * y) + jnp.sum(voxels * wanted)
+        np.testing.assert_allclose(left, jnp.sum(sent * x) + jnp.sum(emitted * source), rtol=1e-13)
+
+
+def test_slopes_of_linear_light_are_its_own():
+    # J = 1 + x/10 + y/20 - z/30 in a white medium: the slopes are exact, at the sides too.
+    scene = rm.Scene(rm.Lattice((5, 4, 6)), medium=rm.Medium(0.6))
+    layout = make_layout(scene, find_surfaces(scene))
+    field = layout.to_padded(jnp.asarray((1 + scene.lattice.centers() @ [1 / 10, 1 / 20, -1 / 30])[None], float))
+    white = layout.to_padded(jnp.ones((1, *layout.shape)))
+    slopes = source_slopes(layout, field, white, 0.6 * white)
+    for slope, expected in zip(slopes, (1 / 10, 1 / 20, -1 / 30), strict=True):
+        np.testing.assert_allclose(layout.from_padded(slope), expected, rtol=2e-5)
 
 
 @pytest.mark.parametrize("medium", [False, True], ids=["vacuum", "fog"])

@@ -44,8 +44,13 @@ class CubeTransport(eqx.Module):
     cell: Int[Array, " E"]
 
     @eqx.filter_jit
-    def __call__(self, leaving: Light, sky: Float[Array, "C n"] | None = None, fluence: bool = True) -> Light:
-        """Mean radiance arriving at SURFACE nodes and in voxels, of what leaves them and comes in through open sides."""
+    def __call__(
+        self, leaving: Light, sky: Float[Array, "C n"] | None = None, fluence: bool = True, scattered: bool = False
+    ) -> Light:
+        """Mean radiance arriving at SURFACE nodes and in voxels, of what leaves them and comes in through open sides.
+
+        Light that is `scattered` is the same all over a voxel, as all light in the paper.
+        """
         fields = self._with_light(leaving)
         arriving, seen = coordinate_evolution(self.lattice, fields, self.faces, self.scheme, sky, None, fluence)
         return Light(arriving.reshape(len(arriving), -1)[:, self.cell], seen)

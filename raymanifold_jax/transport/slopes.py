@@ -10,7 +10,7 @@ side only where the other holds nothing that scatters. J is continuous where coe
 where light dies out within a voxel, as it does with decrement sqrt(3 (1 - a)) t: a straight line would be negative there. CUT
 voxels have no slope and lend none: their mean is one over an odd part of them. Nor have thin ones: see `thickness`.
 
-Public: `source_slopes`, `thickness`, `THIN`.
+Public: `source_slopes`, `thickness`, `flattening`, `THIN`.
 """
 
 from __future__ import annotations
@@ -30,6 +30,11 @@ def thickness(depth: Array) -> Array:
     return jnp.clip(depth / THIN - 1, 0.0, 1.0)
 
 
+def flattening(depth: Array, albedo: Array) -> Array:
+    """theta, and less of it in voxels that are nearly thin."""
+    return thickness(depth) / (1 + 3 * jnp.maximum(1 - albedo, 0.0) * depth**2)
+
+
 def source_slopes(
     layout: Layout, source: Float[Array, "C X Y Z"], albedo: Float[Array, "C X Y Z"], extinction: Float[Array, "C X Y Z"]
 ) -> tuple[Float[Array, "C X Y Z"], ...]:
@@ -39,8 +44,7 @@ def source_slopes(
     """
     scatters = (albedo > 0) & (layout.plane[0] == 1.0)
     mean = jnp.where(scatters, source / jnp.where(scatters, albedo, 1.0), 0.0)
-    depth = extinction * layout.spacing
-    strength = jnp.where(scatters, thickness(depth) * albedo / (1 + 3 * jnp.maximum(1 - albedo, 0.0) * depth**2), 0.0)
+    strength = jnp.where(scatters, albedo * flattening(extinction * layout.spacing, albedo), 0.0)
     there = scatters.astype(source.dtype)
     slopes = []
     for axis in range(3):

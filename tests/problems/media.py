@@ -70,6 +70,7 @@ def _kobayashi_case(number: int, case: str) -> Case:
         readers={"values": partial(_read_kobayashi, number, case)},
         sizes=(10, 30, 50),
         targets=same(fluence=target),
+        directions=200 if case == "i" else 400,
     )
 
 
