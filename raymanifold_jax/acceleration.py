@@ -264,9 +264,7 @@ def _distance(solid: np.ndarray, surfaces: Surfaces, shape: tuple[int, int, int]
 
 
 @eqx.filter_jit
-def _assemble(
-    stuff: Materials, free, ends, area, probe, spacing: float, periodic: tuple[bool, ...], sloped: bool
-) -> Diffusion:
+def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodic: tuple[bool, ...], sloped: bool) -> Diffusion:
     real, bands = stuff.albedo.dtype, stuff.albedo.shape[0]
     free, ends, area = (x.astype(real) for x in (free, ends, area))
     extinction = 0.0 if stuff.extinction is None else stuff.extinction * spacing

@@ -35,7 +35,7 @@ from jaxtyping import Array, Float
 from . import checks
 from .prepare import prepare
 from .progress import Progress, make_progress
-from .quadrature import Quadrature, fibonacci
+from .quadrature import Quadrature, for_scene
 from .scene import Scene
 from .solution import Solution
 from .solve import solve
@@ -126,7 +126,7 @@ def fit(
     chosen = _Chosen(scene, parameters)
     targets = [targets] if isinstance(targets, Target) else list(targets)
     _check(scene, targets, method, tolerance, max_evaluations)
-    quadrature = fibonacci(200) if quadrature is None else quadrature
+    quadrature = for_scene(scene) if quadrature is None else quadrature
     run = _Run(chosen, targets, quadrature, float(rtol), max_evaluations, float(target_rms), make_progress(progress))
     few = min(chosen.size, run.count) <= _FEW
     method = ("gauss-newton" if few else "l-bfgs") if method == "auto" else method

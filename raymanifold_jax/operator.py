@@ -268,8 +268,9 @@ def make_transport(
 
     **Raises** `ValueError` where rays along a periodic axis never end.
     """
-    # What no parameter moves is worked out now, even while JAX traces the rest.
-    with nullcontext() if checks.is_traced((extinction, albedo)) else jax.ensure_compile_time_eval():
+    # What no parameter moves is worked out now, even while JAX stages the rest.
+    late = checks.is_traced(jnp.zeros(())) and not checks.is_traced((extinction, albedo))
+    with jax.ensure_compile_time_eval() if late else nullcontext():
         return _make_transport(layout, quadrature, extinction, bands, beam, area, albedo)
 
 

@@ -102,11 +102,14 @@ def _part(axes: tuple[Axis, ...], emission: np.ndarray, box: tuple[slice, ...], 
     # Two blocks along the whole of it, of which one is an image's where it touches a mirror.
     side = max(whole) / 2
     number = [max(1, round(blocks * (b - a) / side)) for a, b in ends]
-    fine = max(math.ceil(n / (b - a)) for n, (a, b) in zip(number, ends, strict=True))  # voxels are cut where blocks are smaller
+    # Voxels are cut where blocks are smaller.
+    fine = max(math.ceil(n / (b - a)) for n, (a, b) in zip(number, ends, strict=True))
     inside = emission[(slice(None), *box)]
     for axis in range(3):
         inside = inside.repeat(fine, axis + 1)
-    cuts = [np.unique(np.linspace(0, fine * (b - a), n + 1).round().astype(int)) for n, (a, b) in zip(number, ends, strict=True)]
+    cuts = [
+        np.unique(np.linspace(0, fine * (b - a), n + 1).round().astype(int)) for n, (a, b) in zip(number, ends, strict=True)
+    ]
     lowest = np.array([a for a, _ in ends])
     points, power = [], []
     for corner in itertools.product(*(range(len(c) - 1) for c in cuts)):

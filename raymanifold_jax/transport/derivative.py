@@ -126,8 +126,8 @@ class _SweepAdjoint:
         if inflow is not None:
             light = Inflow(found.radiance, None if inflow.factor is None else found.factor)  # pyright: ignore
         # Only what is wanted is read: the geometry stands for itself.
-        source = None if sent[1] is None else found.source
-        return layout, ordinates, found.extinction, found.exitance, source, found.slopes, light
+        source, slopes = (None if s is None else f for s, f in zip(sent[1:], (found.source, found.slopes), strict=True))
+        return layout, ordinates, found.extinction, found.exitance, source, slopes, light
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,6 +159,8 @@ def _whole_adjoint(manner: Manner, layout: Layout, ordinates, extinction, weight
         dark = jnp.zeros((bands, *layout.shape), real)
         source = dark if source is None else source
         in_voxels = dark if in_voxels is None else in_voxels
+        if slopes is None and manner.onward:  # thick: bounces have them
+            slopes = (jnp.zeros_like(extinction),) * 3
     return _adjoint(manner, True, layout, ordinates, extinction, (at_elements, in_voxels), (exitance, source, slopes), inflow)
 
 
