@@ -62,7 +62,7 @@ def first_flight(
     compact = compact_sources(scene, surfaces)
     glow = materials.medium_source
     if compact is not None and glow is not None:
-        glow = jnp.where(jnp.asarray(compact.emission > 0), 0.0, glow)
+        glow = jnp.where(compact.emits, 0.0, glow)
     swept = _swept(transport, Light(materials.emission, glow), sky)
     if (points := small_emitters(scene, surfaces)) is not None:
         # The elements' share of the emitters' light is taken exactly; the sweep's share of it is taken out.

@@ -120,7 +120,7 @@ def _gathered(solution: Solution, points: Any, normals: Any, number: int) -> Flo
     field = light_field(solution)
     compact = compact_sources(scene, solution.elements, _BLOCKS)
     if compact is not None:
-        rest = np.where(compact.emission > 0, 0.0, np.asarray(emission_of(scene)))
+        rest = jnp.where(compact.emits, 0.0, emission_of(scene))
         field = eqx.tree_at(lambda f: f.scene, field, with_emission(scene, rest))
     emitters = small_emitters(scene, solution.elements) if not _has_images(scene) else None
     far = np.zeros(len(points), bool) if emitters is None else ~emitters.near(points)

@@ -108,19 +108,21 @@ class IrradianceTarget(Target):
 
 
 class FluenceTarget(Target):
-    """Fluence measured at points in space, (n[, bands])."""
+    """Fluence measured at points in space, (n[, bands]); `directions` as for `fluence`."""
 
     points: Float[np.ndarray, "n 3"]
     values: Float[np.ndarray, "n *bands"]
     weight: Float[np.ndarray, "n *bands"]
+    directions: int = eqx.field(static=True)
 
-    def __init__(self, points: Any, values: Any, weight: Any = 1.0):
+    def __init__(self, points: Any, values: Any, weight: Any = 1.0, directions: int = 2048):
         self.points = np.asarray(checks.points("points", points))
         self.values = _one_each(values, self.points)
         self.weight = _weight(weight, None, self.values)
+        self.directions = checks.positive_int("directions", directions, at_least=0)
 
     def predicted(self, solution: Solution) -> Float[jax.Array, "n *bands"]:
-        return fluence(solution, self.points)
+        return fluence(solution, self.points, self.directions)
 
     def check(self, name: str, scene: Scene) -> None:
         _check_bands(name, self.values, 1, scene)

@@ -52,8 +52,9 @@ def test_albedos_from_a_picture_and_irradiances():
 
 def test_contradictory_targets_leave_a_residual():
     # Two meters that differ by 20 % agree on nothing better than the middle: each is left 10 % off.
-    truth = solved(box())
-    targets = [irradiances(truth, factor) for factor in (0.9, 1.1)]
+    middle = [[0.5, 0.5, 0.5], [0.2, 0.8, 0.3]]
+    truth = rm.fluence(solved(box()), middle, directions=0)
+    targets = [rm.FluenceTarget(middle, factor * truth, directions=0) for factor in (0.9, 1.1)]
     found = rm.fit(box(0.6), targets, NAMES[1], QUADRATURE, progress=False)
     expected = 0.1 * np.sqrt(np.mean(np.square(targets[0].values / 0.9)))
     np.testing.assert_allclose(found.residual, expected, rtol=0.05)
