@@ -33,6 +33,7 @@ from .quadrature import Quadrature, for_scene
 from .scene import OPEN, PointLight, Scene, Sky, Sun
 from .solution import Energy, Solution, _Hidden
 from .solvers import Anderson, Jacobi, Krylov, automatic
+from .source_checks import check_sources
 from .surfaces import Surfaces
 from .transport.characteristic import Characteristic
 from .transport.light_ray_cube import LightRayCube
@@ -88,6 +89,8 @@ def solve(
         meter.start(f"solve {scene.summary()}")
         prepared = prepare(scene) if prepared is None else prepared
         surfaces = prepared.surfaces
+        with jax.ensure_compile_time_eval():  # of what is known while JAX stages the rest
+            check_sources(scene, surfaces)
         stuff = materials(scene, surfaces)
         _check_steady(scene, surfaces, stuff)
         nodes = None if cube is None else make_cube_system(scene, surfaces, cube)

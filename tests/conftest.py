@@ -2,9 +2,13 @@
 
 import os
 from collections.abc import Iterator
+from pathlib import Path
 
 import jax
 import pytest
+
+_MAPS = Path("/proc/self/maps")
+_MANY = 15_000  # of the 65 530 regions of memory that Linux grants a process
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -20,6 +24,14 @@ def pytest_configure(config: pytest.Config) -> None:
     jax.config.update(
         "jax_persistent_cache_min_compile_time_secs", float(os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"])
     )
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_programs() -> Iterator[None]:
+    """Forget compiled programs before they are too many: each holds memory regions, and without any left XLA crashes."""
+    yield
+    if _MAPS.exists() and len(_MAPS.read_bytes().splitlines()) > _MANY:
+        jax.clear_caches()
 
 
 @pytest.fixture

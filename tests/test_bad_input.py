@@ -41,6 +41,39 @@ def test_solve_refuses(scene, options, error, message):
         rm.solve(scene, **options)
 
 
+def scene_with(*lights, solid=None, sides=None):
+    solids = [rm.Solid(rm.Sphere((1, 1, 1), 0.5))] + ([] if solid is None else [solid])
+    return rm.Scene(rm.Lattice((8, 8, 8), 0.25), solids, lights=lights, boundary=sides or rm.Boundary())
+
+
+@pytest.mark.parametrize(
+    ("scene", "message"),
+    [
+        (
+            scene_with(rm.PointLight((1, 1, 1))),
+            r"lights\[0\]: position: got \[1.*, 2 voxels inside a solid.*give it an emission",
+        ),
+        (
+            scene_with(rm.Sky(), rm.PointLight((5, 1, 1))),
+            r"lights\[1\]: position: got .*expected a point of the lattice.*rm\.Sun",
+        ),
+        (scene_with(rm.Sun((0, 0, -1)), sides=rm.Boundary(z=rm.Wall(0.5))), r"lights\[0\]: .*enters by \(z\+\); open one"),
+        (scene_with(rm.Sun((0, 1, -1)), sides=rm.Boundary(rm.OPEN, rm.MIRROR, rm.PERIODIC)), r"enters by \(y-, z\+\)"),
+        (
+            scene_with(solid=rm.Solid(rm.Sphere((9, 9, 9), 0.5), 0.5, 1.0)),
+            r"solids\[1\]: got an emitter \(Sphere\).*move it into",
+        ),
+        (
+            scene_with(solid=rm.Solid(rm.Sphere((0.4, 0.4, 0.4), 0.01), 0.5, 1.0)),
+            r"solids\[1\].*larger than 0\.25, or use rm\.Po",
+        ),
+    ],
+)
+def test_sources_without_light(scene, message):
+    with pytest.raises(ValueError, match=message):
+        rm.solve(scene)
+
+
 @pytest.mark.parametrize("rtol", [0, -1e-3, 1, 1.5, np.nan, np.inf, 1e-7, "1e-4", None])
 def test_rtol_out_of_range(rtol):
     with pytest.raises(ValueError, match=r"rtol: got .*expected a number from 1\.9e-06 \(what float32 can hold\) to 1"):
