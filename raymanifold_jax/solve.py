@@ -57,7 +57,7 @@ def solve(
 
     JAX differentiates the solution in every physical value of the scene, forwards and backwards, at about the cost of one more
     solve (`implicit`); shapes, and directions and positions of lights, have no derivative. Under `jit` and `vmap` no error
-    bound is known (`Solution.error_bound` is nan).
+    bound is known (`Solution.error_bound` is nan), and emission that is traced is swept, in compact parts too.
 
     **Arguments:**
 

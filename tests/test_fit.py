@@ -50,6 +50,7 @@ def test_albedos_from_a_picture_and_irradiances():
     assert not found.unseen
 
 
+@pytest.mark.slow
 def test_contradictory_targets_leave_a_residual():
     # Two meters that differ by 20 % agree on nothing better than the middle: each is left 10 % off.
     middle = [[0.5, 0.5, 0.5], [0.2, 0.8, 0.3]]
