@@ -207,8 +207,7 @@ def test_batches_are_solved_one_after_the_other(x64):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("sides", ["open", "mirror", "periodic"])
-@pytest.mark.parametrize("fog", [0.2, THICK], ids=["thin", "thick"])
+@pytest.mark.parametrize(("fog", "sides"), [(0.2, "open"), (0.2, "periodic"), (THICK, "mirror"), (THICK, "periodic")])
 def test_adjoint_sweeps(fog, sides, x64):
     # <J t, y> = <t, J'y> to rounding, J the derivative of a sweep or a transposed sweep in everything it depends on: in thick
     # voxels in the slopes of sources as well.
