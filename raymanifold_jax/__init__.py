@@ -36,6 +36,13 @@ _MODULE_OF = {
     "Sun": "scene",
     "Wall": "scene",
     "Checkpoint": "checkpoint",
+    "Texture": "texture",
+    "Fit": "fit",
+    "Parameter": "fit",
+    "fit": "fit",
+    "FluenceTarget": "targets",
+    "IrradianceTarget": "targets",
+    "PictureTarget": "targets",
     "load": "load",
     "Characteristic": "transport.characteristic",
     "LightRayCube": "transport.light_ray_cube",
@@ -73,6 +80,9 @@ if TYPE_CHECKING:
     from raymanifold_jax.cost import cost_report as cost_report
     from raymanifold_jax.error_estimate import ErrorEstimate as ErrorEstimate
     from raymanifold_jax.error_estimate import estimate_error as estimate_error
+    from raymanifold_jax.fit import Fit as Fit
+    from raymanifold_jax.fit import Parameter as Parameter
+    from raymanifold_jax.fit import fit as fit
     from raymanifold_jax.gather import fluence as fluence
     from raymanifold_jax.gather import irradiance as irradiance
     from raymanifold_jax.gather import outgoing_flux as outgoing_flux
@@ -105,6 +115,10 @@ if TYPE_CHECKING:
     from raymanifold_jax.solvers import Anderson as Anderson
     from raymanifold_jax.solvers import Jacobi as Jacobi
     from raymanifold_jax.solvers import Krylov as Krylov
+    from raymanifold_jax.targets import FluenceTarget as FluenceTarget
+    from raymanifold_jax.targets import IrradianceTarget as IrradianceTarget
+    from raymanifold_jax.targets import PictureTarget as PictureTarget
+    from raymanifold_jax.texture import Texture as Texture
     from raymanifold_jax.transport.characteristic import Characteristic as Characteristic
     from raymanifold_jax.transport.light_ray_cube import LightRayCube as LightRayCube
     from raymanifold_jax.voxels import Voxels as Voxels

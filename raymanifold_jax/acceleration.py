@@ -85,6 +85,14 @@ class Diffusion(eqx.Module):
         """M' = I + g A^-1 R."""
         return _transposed(self, light)
 
+    def of_arriving(self, light: Light) -> Light:
+        """The same where bounces take arriving light to arriving light: I + A^-1 g R."""
+        return _of_arriving(self, light)
+
+    def of_arriving_transposed(self, light: Light) -> Light:
+        """Its transpose: I + R g A^-1, both steps in turn."""
+        return _of_arriving_transposed(self, light)
+
 
 @eqx.filter_jit
 def _precondition(near: Diffusion, leaving: Light) -> Light:
@@ -96,6 +104,17 @@ def _precondition(near: Diffusion, leaving: Light) -> Light:
 def _transposed(near: Diffusion, light: Light) -> Light:
     weighted = jax.tree.map(jnp.multiply, near.albedo, light)
     return light + jax.tree.map(jnp.multiply, near.power, _spread_transposed(near, weighted))
+
+
+@eqx.filter_jit
+def _of_arriving(near: Diffusion, light: Light) -> Light:
+    return light + _spread(near, jax.tree.map(lambda g, r, x: g * r * x, near.power, near.albedo, light))
+
+
+@eqx.filter_jit
+def _of_arriving_transposed(near: Diffusion, light: Light) -> Light:
+    spread = _spread_transposed(near, light)
+    return light + jax.tree.map(lambda g, r, x: g * r * x, near.power, near.albedo, spread)
 
 
 def _spread(near: Diffusion, sent: Light) -> Light:

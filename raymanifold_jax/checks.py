@@ -10,7 +10,7 @@ Values that JAX is tracing have no numbers to look at: for those only the shape 
 numbers keep their dtype; geometry (`vector3`, `unit_vector`, `points`) becomes float64 in numpy, unless it is traced.
 
 Public names: `array`, `finite`, `non_negative`, `positive`, `in_unit_interval`, `vector3`, `unit_vector`, `points`,
-`coordinates`, `positive_int`, `instance`, `is_traced`, `fail`.
+`coordinates`, `positive_int`, `instance`, `is_traced`, `surely`, `may_differ_from_zero`, `fail`.
 """
 
 import operator
@@ -32,6 +32,19 @@ def fail(name: str, got: object, expected: str, advice: str, error: type[Excepti
 def is_traced(value: object) -> bool:
     """Whether any part of `value` is a JAX tracer, so that its numbers are not known yet."""
     return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(value))
+
+
+def surely(flag: Any) -> bool:
+    """Whether a flag is true; False where JAX traces it and does not know yet."""
+    try:
+        return bool(flag)
+    except jax.errors.ConcretizationTypeError:
+        return False
+
+
+def may_differ_from_zero(value: Any) -> bool:
+    """Whether any part of `value` is traced, and so may become anything, or is above 0."""
+    return is_traced(value) or any(bool(np.any(np.asarray(leaf) > 0)) for leaf in jax.tree.leaves(value))
 
 
 def array(name: str, value: Any, shape: tuple[int, ...] | None = None, *, advice: str = "") -> Numbers:

@@ -21,9 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from . import checks
 from .layout import Layout
 from .march import fill, transmittance
 from .operator import Light, Materials, Transport, make_transport
+from .prepare import Prepared
 from .quadrature import Quadrature
 from .scene import OPEN, PointLight, Scene, Sky, Sun, Wall
 from .surfaces import Surfaces, patch_points
@@ -46,7 +48,12 @@ class Direct(eqx.Module):
 
 
 def first_flight(
-    scene: Scene, surfaces: Surfaces, transport: Transport, quadrature: Quadrature, materials: Materials
+    scene: Scene,
+    surfaces: Surfaces,
+    transport: Transport,
+    quadrature: Quadrature,
+    materials: Materials,
+    prepared: Prepared | None = None,
 ) -> Direct:
     """All light that arrives straight from sources."""
     layout = transport.layout
@@ -55,7 +62,7 @@ def first_flight(
     compact = compact_sources(scene, surfaces)
     glow = materials.medium_source
     if compact is not None and glow is not None:
-        glow = jnp.where(jnp.asarray(compact.emission > 0), 0.0, glow)
+        glow = jnp.where(compact.emits, 0.0, glow)
     swept = _swept(transport, Light(materials.emission, glow), sky)
     if (points := small_emitters(scene, surfaces)) is not None:
         # The elements' share of the emitters' light is taken exactly; the sweep's share of it is taken out.
@@ -67,13 +74,13 @@ def first_flight(
         if isinstance(light, PointLight):
             swept = swept + _from_point(scene, surfaces, light)
     zero = jax.tree.map(jnp.zeros_like, swept)
-    suns = [_from_sun(scene, surfaces, layout, light, materials) for light in scene.lights if isinstance(light, Sun)]
+    suns = [_from_sun(scene, surfaces, layout, light, materials, prepared) for light in scene.lights if isinstance(light, Sun)]
     return Direct(sun=sum(suns, start=zero), rest=swept)
 
 
 def _swept(transport: Transport, leaving: Light, sky: Inflow | None) -> Light:
     """One sweep of what leaves surfaces and medium and of the sky; none if all are dark."""
-    if sky is None and not any(bool(jnp.any(light)) for light in jax.tree.leaves(leaving)):
+    if sky is None and not checks.may_differ_from_zero(leaving):
         shape = (leaving.elements.shape[0], *transport.layout.shape)
         return Light(jnp.zeros_like(leaving.elements), jnp.zeros(shape, leaving.elements.dtype))
     return transport(leaving, sky)
@@ -108,13 +115,17 @@ def _dark(materials: Materials) -> Light:
     return Light(jnp.zeros_like(materials.emission), voxels)
 
 
-def _from_sun(scene: Scene, surfaces: Surfaces, layout: Layout, sun: Sun, materials: Materials) -> Light:
+def _from_sun(
+    scene: Scene, surfaces: Surfaces, layout: Layout, sun: Sun, materials: Materials, prepared: Prepared | None = None
+) -> Light:
     side = (np.arange(_SUN_OFFSETS) + 0.5) / _SUN_OFFSETS
     offsets = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
     count = len(offsets)
     direction = np.asarray(sun.direction)
     beam = Quadrature(np.tile(direction, (count, 1)), np.full(count, 1 / count), offsets, "sun")
-    transport = _beam_transport(layout, beam, materials.extinction, scene.bands)
+    make = lambda: _beam_transport(layout, beam, materials.extinction, scene.bands)
+    key = ("sun", *direction.tolist(), scene.bands)
+    transport = make() if prepared is None else prepared.transport(key, materials.extinction, make)
     images = layout.unfolding.images()
     irradiance = jnp.broadcast_to(sun.irradiance, (scene.bands,))
     # Only the scene itself is lit; a mirror image of it gets what mirrors reflect.
@@ -148,7 +159,7 @@ class EmitterPoints(eqx.Module):
 def small_emitters(scene: Scene, surfaces: Surfaces) -> EmitterPoints | None:
     """Points on the emitting surfaces, if these are a small part of all surfaces; else None."""
     owners = [*scene.solids, *scene.boundary.sides]
-    emits = np.array([bool(np.any(np.asarray(getattr(o, "emission", 0.0)) > 0)) for o in owners], bool)
+    emits = np.array([checks.may_differ_from_zero(getattr(o, "emission", 0.0)) for o in owners], bool)
     emitters = np.nonzero(emits[surfaces.material])[0] if len(surfaces) else []
     if not len(emitters) or surfaces.area[emitters].sum() > _SMALL * surfaces.area.sum():
         return None

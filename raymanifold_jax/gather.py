@@ -17,6 +17,7 @@ import weakref
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -26,8 +27,9 @@ from .direct import emitter_light, sky_radiance, small_emitters
 from .directions import cosine_hemisphere, frames, whole_sphere
 from .interpolation import ElementTable, element_table, interpolate_irradiance, slopes
 from .march import fill, interpolate, march_between, transmittance, transmittance_between
-from .scene import MIRROR, OPEN, PERIODIC, PointLight, Scene, Sun, Wall
+from .scene import MIRROR, OPEN, PERIODIC, PointLight, Scene, Solid, Sun, Wall
 from .solution import Solution
+from .texture import Texture, value_at
 from .trace import Hit, trace_rays, visible
 from .unfolding import in_blocks, sloped, to_voxel
 from .volume_sources import compact_sources, emission_of, volume_light, with_emission
@@ -118,7 +120,7 @@ def _gathered(solution: Solution, points: Any, normals: Any, number: int) -> Flo
     field = light_field(solution)
     compact = compact_sources(scene, solution.elements, _BLOCKS)
     if compact is not None:
-        rest = np.where(compact.emission > 0, 0.0, np.asarray(emission_of(scene)))
+        rest = jnp.where(compact.emits, 0.0, emission_of(scene))
         field = eqx.tree_at(lambda f: f.scene, field, with_emission(scene, rest))
     emitters = small_emitters(scene, solution.elements) if not _has_images(scene) else None
     far = np.zeros(len(points), bool) if emitters is None else ~emitters.near(points)
@@ -213,7 +215,7 @@ def _light_field(solution: Solution) -> LightField:
         table=table,
         irradiance=values,
         slope=slopes(scene, table, values),
-        albedo=jnp.stack([spread(o, "albedo") for o in owners]),
+        albedo=jnp.stack([spread(None if o is None or isinstance(o.albedo, Texture) else o, "albedo") for o in owners]),
         emission=jnp.stack([spread(o, "emission") for o in owners]),
     )
 
@@ -225,8 +227,17 @@ def surface_radiance(field: LightField, hit: Hit) -> Float[Array, "n C"]:
     arriving = interpolate_irradiance(scene, field.table, field.irradiance, field.slope, u, hit.normal)
     arriving = arriving + _sun_irradiance(scene, hit.point + _OFF * scene.lattice.spacing * hit.normal, hit.normal)
     material = jnp.maximum(hit.material, 0)
-    leaving = field.albedo[material] / jnp.pi * arriving + field.emission[material]
+    leaving = _albedo(field, material, hit.point) / jnp.pi * arriving + field.emission[material]
     return jnp.where((hit.material >= 0)[:, None], leaving, 0.0)
+
+
+def _albedo(field: LightField, material: Array, points: Array) -> Float[Array, "n C"]:
+    scene, albedo = field.scene, field.albedo[material]
+    for number, owner in enumerate([*scene.solids, *scene.boundary.sides]):
+        if isinstance(owner, Solid | Wall) and isinstance(owner.albedo, Texture):
+            here = value_at(owner.albedo, scene.lattice, points, scene.bands)
+            albedo = jnp.where((material == number)[:, None], here, albedo)
+    return albedo
 
 
 def radiance_along(field: LightField, origins: Array, directions: Array) -> Float[Array, "n C"]:
@@ -362,10 +373,18 @@ def _lift(scene: Scene, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     _check_depth(scene, "points", points, _DEEP, "on a surface", advice)
     spacing = lattice.spacing
     for _ in range(2 if len(points) and scene.solids else 1):
-        near = np.asarray(in_blocks(Scene.distance, scene, (points,)), np.float64) if len(points) else np.zeros(0)
+        with jax.ensure_compile_time_eval():
+            near = (
+                np.asarray(in_blocks(Scene.distance, _untraced(scene), (points,)), np.float64) if len(points) else np.zeros(0)
+            )
         points = points + np.maximum(_OFF * spacing - near, 0.0)[:, None] * normals
     margin = _OFF * spacing
     return np.clip(points, lattice.lower + margin, lattice.upper - margin)
+
+
+def _untraced(scene: Scene) -> Scene:
+    """The same geometry, with any numbers for values that are traced."""
+    return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype) if checks.is_traced(leaf) else leaf, scene)
 
 
 def _box(scene: Scene) -> str:

@@ -12,7 +12,8 @@ Public: `transmittance`, `march`, `fill`, `interpolate`; for blocks of rays `tra
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
+from .adjoint import with_adjoint
 from .scene import Scene
 from .unfolding import Axis, box_span, in_blocks, sloped, to_voxel, unfolded_axes
 
@@ -96,6 +98,14 @@ def _rimmed(field: Float[Array, "C nx ny nz"]) -> Float[Array, "C V"]:
 
 def _interpolate(axes: tuple[Axis, ...], rimmed: Array, u: tuple[Array, ...]) -> Array:
     """`rimmed` is what `_rimmed` makes of a field."""
+    total = jnp.zeros((rimmed.shape[0], *u[0].shape), rimmed.dtype)
+    for weight, voxel in _corners(axes, u):
+        total = total + weight * rimmed.at[:, voxel].get(mode="promise_in_bounds")
+    return total
+
+
+def _corners(axes: tuple[Axis, ...], u: tuple[Array, ...]) -> Iterator[tuple[Array, Array]]:
+    """The eight voxels of a rimmed field around points, with their weights."""
     corners = []
     for axis, x in zip(axes, u, strict=True):
         floor = jnp.floor(x - 0.5)
@@ -103,12 +113,10 @@ def _interpolate(axes: tuple[Axis, ...], rimmed: Array, u: tuple[Array, ...]) ->
         index = floor.astype(jnp.int32)
         corners.append(((1 - after, axis.fold_index(index, 1) + 1), (after, axis.fold_index(index + 1, 1) + 1)))
     ny, nz = axes[1].count + 2, axes[2].count + 2
-    total = jnp.zeros((rimmed.shape[0], *u[0].shape), rimmed.dtype)
     for a, i in corners[0]:
         for b, j in corners[1]:
             for c, k in corners[2]:
-                total = total + (a * b * c) * rimmed.at[:, (i * ny + j) * nz + k].get(mode="promise_in_bounds")
-    return total
+                yield a * b * c, (i * ny + j) * nz + k
 
 
 def _coefficients(scene: Scene) -> list[Array]:
@@ -128,7 +136,7 @@ def _center(depth: Array) -> Array:
     """Where in a segment of this optical depth, as a share of it, lies the centre of what reaches its near end."""
     small = depth < 0.1
     safe = jnp.where(small, 1.0, depth)
-    return jnp.where(small, 0.5 - depth / 12, 1 / safe - 1 / jnp.expm1(jnp.minimum(safe, 80.0)))
+    return jnp.where(small, 0.5 - depth / 12 + depth**3 / 720, 1 / safe - 1 / jnp.expm1(jnp.minimum(safe, 80.0)))
 
 
 def _transmittance(scene: Scene, start: Array, end: Array) -> Array:
@@ -150,8 +158,8 @@ def transmittance_between(scene: Scene, o: Array, w: Array, start: Array, stop: 
     if extinction.shape[1] == 1:
         depth = extinction * ((stop - start) * spacing)
     else:
-        add = lambda depth, point, voxel, length: depth + _at(extinction, voxel) * (length * spacing)
-        depth = _walk(unfolded_axes(scene), o, w, start, stop, add, jnp.zeros((len(extinction), len(o)), o.dtype))
+        axes = unfolded_axes(scene)
+        depth = with_adjoint(_Depth(axes), _DepthAdjoint(axes))(extinction, o, w, start, stop) * spacing
     return jnp.broadcast_to(jnp.exp(-depth), (scene.bands, len(o))).T
 
 
@@ -170,22 +178,119 @@ def march_between(
     w = sloped(directions)
     o = to_voxel(scene, origins + start[:, None] * directions)
     length = jnp.maximum(stop - start, 0.0) / spacing
-    coefficients = _coefficients(scene)
+    coefficients = tuple(c * spacing for c in _coefficients(scene))
     uniform = all(c.shape[1] == 1 for c in coefficients)
-
-    def add(state, point, voxel, step):
-        radiance, depth = state
-        scattering, absorption, source = (_at(c, voxel) for c in coefficients)
-        own = (scattering + absorption) * (step * spacing)
-        if rimmed is not None:
-            seen = _interpolate(axes, rimmed, point(step * _center(own.mean(0))))
-            source = source + scattering / (4 * jnp.pi) * seen
-        return radiance + jnp.exp(-depth) * source * (step * spacing) * _share(own), depth + own
-
-    state = (jnp.zeros(shape, o.dtype), jnp.zeros(shape, o.dtype))
-    advance = _stride if uniform else _walk
-    radiance, depth = advance(axes, o, w, jnp.zeros_like(length), length, add, state)
+    how = _March(axes, scene.bands, uniform), _MarchAdjoint(axes, scene.bands, uniform)
+    radiance, depth = with_adjoint(*how)(coefficients, rimmed, o, w, length)
     return radiance.T, jnp.exp(-depth).T
+
+
+@dataclasses.dataclass(frozen=True)
+class _Depth:
+    """Sums of a coefficient (b, V) over the lengths of rays in voxels: (b, n)."""
+
+    axes: tuple[Axis, ...]
+
+    def __call__(self, extinction: Array, o: Array, w: Array, start: Array, stop: Array) -> Array:
+        add = lambda depth, point, voxel, length: depth + _at(extinction, voxel) * length
+        return _walk(self.axes, o, w, start, stop, add, jnp.zeros((len(extinction), len(o)), o.dtype))
+
+
+@dataclasses.dataclass(frozen=True)
+class _DepthAdjoint:
+    axes: tuple[Axis, ...]
+
+    def __call__(self, arguments, wanted, weights: Array):
+        extinction, o, w, start, stop = arguments
+        add = lambda total, point, voxel, length: total.at[:, voxel].add(weights * length)
+        return _walk(self.axes, o, w, start, stop, add, jnp.zeros_like(extinction)), None, None, None, None
+
+
+@dataclasses.dataclass(frozen=True)
+class _March:
+    """Radiance added along rays and their optical depths, (C, n) each, of coefficients (b, V) per voxel's side."""
+
+    axes: tuple[Axis, ...]
+    bands: int
+    uniform: bool
+
+    def __call__(self, coefficients: tuple[Array, ...], rimmed: Array | None, o: Array, w: Array, length: Array):
+        def add(state, point, voxel, step):
+            radiance, depth = state
+            values = tuple(_at(c, voxel) for c in coefficients)
+            fluence = None if rimmed is None else _interpolate(self.axes, rimmed, _seen_from(values, point, step))
+            added, own = _added(values, fluence, depth, step)
+            return radiance + added, depth + own
+
+        nothing = jnp.zeros((self.bands, len(o)), o.dtype)
+        return self.advance(o, w, length, add, (nothing, nothing))
+
+    def advance(self, o: Array, w: Array, length: Array, add: Callable, state: Any) -> Any:
+        return (_stride if self.uniform else _walk)(self.axes, o, w, jnp.zeros_like(length), length, add, state)
+
+
+def _seen_from(coefficients: tuple[Array, ...], point: Callable, step: Array) -> tuple[Array, ...]:
+    """The centre of what a segment sends."""
+    scattering, absorption, _ = coefficients
+    return point(step * _center(((scattering + absorption) * step).mean(0)))
+
+
+def _added(coefficients: tuple[Array, ...], fluence: Array | None, depth: Array, step: Array) -> tuple[Array, Array]:
+    """The radiance that one segment sends through the depth before it, and its own depth."""
+    scattering, absorption, source = coefficients
+    if fluence is not None:
+        source = source + scattering / (4 * jnp.pi) * fluence
+    own = (scattering + absorption) * step
+    return jnp.exp(-depth) * source * step * _share(own), jnp.broadcast_to(own, depth.shape)
+
+
+@dataclasses.dataclass(frozen=True)
+class _MarchAdjoint:
+    """By a second march: of all that lies behind a segment, the total radiance minus that so far, its depth takes a share."""
+
+    axes: tuple[Axis, ...]
+    bands: int
+    uniform: bool
+
+    def __call__(self, arguments, wanted, weights: tuple[Array, Array]):
+        coefficients, rimmed, o, w, length = arguments
+        march = _March(self.axes, self.bands, self.uniform)
+        total, _ = march(*arguments)
+
+        def add(state, point, voxel, step):
+            radiance, depth, sums, spread = state
+            values = tuple(_at(c, voxel) for c in coefficients)
+            corners = lambda values: [*_corners(self.axes, _seen_from(values, point, step))]
+            places, around = [], []
+            if rimmed is not None:
+                places = [place for _, place in corners(values)]
+                around = [rimmed.at[:, place].get(mode="promise_in_bounds") for place in places]
+
+            def one(values, around):
+                fluence = None
+                if around:
+                    fluence = sum((w * f for (w, _), f in zip(corners(values), around, strict=True)), start=jnp.zeros(()))
+                return _added(values, fluence, depth, step)
+
+            (added, own), back = jax.vjp(one, values, around)
+            radiance = radiance + added
+            to_values, to_around = back((weights[0], weights[1] - (total - radiance) * weights[0]))
+            sums = tuple(_put(s, voxel, v) for s, v in zip(sums, to_values, strict=True))
+            for place, value in zip(places, to_around, strict=True):
+                spread = spread.at[:, place].add(value)
+            return radiance, depth + own, sums, spread
+
+        nothing = jnp.zeros((self.bands, len(o)), o.dtype)
+        state = (nothing, nothing, *jax.tree.map(jnp.zeros_like, (coefficients, rimmed)))
+        _, _, sums, spread = march.advance(o, w, length, add, state)
+        return sums, spread, None, None, None
+
+
+def _put(total: Array, voxel: Array | None, values: Array) -> Array:
+    """The transpose of `_at`."""
+    if total.shape[1] == 1 or voxel is None:
+        return total + values.sum(1, keepdims=True)
+    return total.at[:, voxel].add(values)
 
 
 def _at(coefficient: Array, voxel: Array | None) -> Array:

@@ -14,20 +14,25 @@ Public: `Light`, `Transport`, `make_transport`, `Materials`, `materials`.
 from __future__ import annotations
 
 import dataclasses
+from contextlib import nullcontext
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
+from . import checks
+from .lattice import Lattice
 from .layout import Layout, Ordinates, make_ordinates
 from .quadrature import Quadrature
 from .scene import Scene, Wall
-from .surfaces import Surfaces
-from .transport.characteristic import Inflow, SweptMedium, count_laps, mark_hits, sweep, thin_limit
+from .surfaces import Surfaces, patch_points
+from .texture import Texture, mean_values
+from .transport.characteristic import Inflow, count_laps, mark_hits, thin_limit
+from .transport.derivative import Manner, swept, unswept
 from .transport.slopes import THIN, source_slopes
-from .transport.transpose import transposed_sweep
 
 _MOST_LAPS = 1 << 16
 _ROUNDS = 1  # of Sinkhorn's iteration; each halves what bias is left, or better, and costs about four sweeps
@@ -80,25 +85,40 @@ def materials(scene: Scene, surfaces: Surfaces) -> Materials:
     spread = lambda value: jnp.broadcast_to(jnp.asarray(value, real), (bands,))
     none = jnp.zeros((bands,), real)
     owners = [*scene.solids, *(side if isinstance(side, Wall) else None for side in scene.boundary.sides)]
-    albedo = jnp.stack([none if o is None else spread(o.albedo) for o in owners], axis=1)
+    plain = [none if o is None or isinstance(o.albedo, Texture) else spread(o.albedo) for o in owners]
     emission = jnp.stack([none if o is None else spread(o.emission) for o in owners], axis=1)
     owner = jnp.asarray(surfaces.material, np.int32)
+    albedo = jnp.stack(plain, axis=1)[:, owner]
+    for number, o in enumerate(owners):
+        if o is not None and isinstance(o.albedo, Texture):
+            rows = np.nonzero(surfaces.material == number)[0]
+            points, weight = _face_points(scene.lattice, surfaces, rows)
+            albedo = albedo.at[:, rows].set(mean_values(o.albedo, scene.lattice, points, weight, bands))
     medium = dict.fromkeys(("scattering_albedo", "medium_source", "extinction", "absorption"))
     if scene.medium is not None:
         shape = (*scene.lattice.shape, bands)
         outside = jnp.asarray(~surfaces.solid)
         fields = [jnp.moveaxis(jnp.broadcast_to(c, shape), -1, 0) for c in scene.medium.coefficients()]
         scattering, absorption, source = (jnp.where(outside, f, 0.0).astype(real) for f in fields)
-        # An emitting voxel that neither absorbs nor scatters has no source function: give it a trace of absorption.
+        # A voxel that neither absorbs nor scatters has no source function: give it a trace of absorption if it emits, or may
+        # become one that does or scatters.
         trace = _TRACE / scene.lattice.spacing
-        absorption = jnp.where((source > 0) & (scattering + absorption < trace), trace, absorption)
+        needed = (source > 0) | checks.is_traced(scene.medium)
+        absorption = absorption + jnp.where(needed & (scattering + absorption < trace), trace, 0.0)
         extinction = scattering + absorption
         divisor = jnp.where(extinction > 0, extinction, 1.0)
         medium = {
             "scattering_albedo": scattering / divisor, "medium_source": source / divisor, "extinction": extinction,
             "absorption": absorption,
         }  # fmt: skip
-    return Materials(albedo[:, owner], emission[:, owner], **medium)
+    return Materials(albedo, emission[:, owner], **medium)
+
+
+def _face_points(lattice: Lattice, surfaces: Surfaces, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points on the faces of some elements, and the area of each."""
+    patch, weight = patch_points(surfaces.normal[rows], surfaces.offset[rows])
+    center = lattice.lower + (surfaces.voxel[rows] + 0.5) * lattice.spacing
+    return center[:, None] + patch * lattice.spacing, weight
 
 
 class Transport(eqx.Module):
@@ -123,14 +143,15 @@ class Transport(eqx.Module):
         """
         leaving, inflow = _balanced(self.factors, leaving, inflow)
         albedo = self.albedo if scattered else None
-        sums = _sweep(self.layout, self.ordinates, self._medium(), leaving, inflow, fluence, albedo)
+        sums = _sweep(self, leaving, inflow, fluence, albedo)
         return _means(sums, Light(self.element_sums, self.voxel_sums))
 
-    def _medium(self) -> SweptMedium | None:
-        """The medium without light of its own."""
-        if self.extinction is None:
-            return None
-        return SweptMedium(self.extinction, jnp.zeros_like(self.extinction), self.thin, onward=self.onward)
+    def transposed(self, asked: Light, scattered: bool = False) -> Light:
+        """The transpose in what leaves: weights of arriving light back to weights of what was sent."""
+        sums = Light(self.element_sums, None if asked.voxels is None else self.voxel_sums)
+        albedo = self.albedo if scattered else None
+        sent = _transposed(self, jax.tree.map(_ratio, asked, sums), albedo)
+        return _balanced(self.factors, sent, None)[0]
 
 
 @eqx.filter_jit
@@ -167,7 +188,7 @@ def _balance(transport: Transport, area: Float[Array, " E"]) -> Transport:
         sums = Light(sums.elements, transport.voxel_sums)
     factors = Light(jnp.ones_like(power.elements))
     for _ in range(_ROUNDS):
-        sent = _transposed(layout, transport.ordinates, transport._medium(), jax.tree.map(_ratio, power, sums))
+        sent = _transposed(transport, jax.tree.map(_ratio, power, sums))
         factors = jax.tree.map(_factor, power, sent)
         swept = _furnace(transport, factors)
         sums = Light(swept.elements, None if power.voxels is None else swept.voxels)
@@ -179,9 +200,13 @@ def _factor(wanted: Array, sent: Array) -> Array:
     return jnp.clip(jnp.where(sent > 0, wanted / jnp.where(sent > 0, sent, 1.0), 1.0), 0.5, 2.0)
 
 
-@eqx.filter_jit
-def _transposed(layout: Layout, ordinates, medium: SweptMedium | None, asked: Light) -> Light:
-    return Light(*transposed_sweep(layout, ordinates, asked.elements, asked.voxels, medium))
+def _transposed(transport: Transport, asked: Light, albedo=None) -> Light:
+    manner = Manner(transport.thin, transport.onward)
+    known = manner, transport.layout, transport.ordinates, transport.extinction
+    exitance, source, slopes = unswept(*known, asked.elements, asked.voxels, albedo is not None)
+    if slopes is not None and source is not None:
+        source = source + _unsloped(transport.layout, slopes, albedo, transport.extinction)
+    return Light(exitance, source)
 
 
 @jax.jit
@@ -189,22 +214,34 @@ def _ratio(sums: Array, furnace: Array) -> Array:
     return jnp.where(furnace > 0, sums / jnp.where(furnace > 0, furnace, 1.0), 0.0)
 
 
-# A program of its own: furnaces, bounces and first flights of one shape share it.
+def _sweep(transport: Transport, leaving: Light, inflow: Inflow | None, fluence: bool, albedo=None) -> Light:
+    """Sums of light; sources in the voxels have slopes if the `albedo` is given that they come by."""
+    slopes = None
+    if albedo is not None and leaving.voxels is not None:
+        slopes = _slopes(transport.layout, leaving.voxels, albedo, transport.extinction)
+    manner = Manner(transport.thin, transport.onward, fluence)
+    known = manner, transport.layout, transport.ordinates, transport.extinction
+    return Light(*swept(*known, leaving.elements, leaving.voxels, slopes, inflow))
+
+
 @eqx.filter_jit
-def _sweep(layout, ordinates, medium: SweptMedium | None, leaving: Light, inflow, fluence: bool, albedo=None) -> Light:
-    if medium is not None:
-        source = medium.source if leaving.voxels is None else layout.to_padded(leaving.voxels)
-        slopes = None if albedo is None else source_slopes(layout, source, layout.to_padded(albedo), medium.extinction)
-        medium = dataclasses.replace(medium, source=source, slopes=slopes)
-    return Light(*sweep(layout, ordinates, leaving.elements, medium, inflow, fluence))
+def _slopes(layout: Layout, source, albedo, extinction) -> tuple[Array, ...]:
+    return source_slopes(layout, layout.to_padded(source), layout.to_padded(albedo), extinction)
+
+
+@eqx.filter_jit
+def _unsloped(layout: Layout, slopes: tuple[Array, ...], albedo, extinction) -> Array:
+    """The transpose of `_slopes` in the source."""
+    return jax.vjp(lambda source: _slopes(layout, source, albedo, extinction), jnp.zeros_like(albedo))[1](slopes)[0]
 
 
 _mark_hits = eqx.filter_jit(mark_hits)
+_count_laps = eqx.filter_jit(count_laps)
 
 
 def _furnace(transport: Transport, leaving: Light) -> Light:
     """The sums at elements and, outside solids, in voxels for light of 1, or in proportion to it."""
-    sums = _sweep(transport.layout, transport.ordinates, transport._medium(), leaving, None, True)
+    sums = _sweep(transport, leaving, None, True)
     assert sums.voxels is not None
     return Light(sums.elements, jnp.where(_solid(transport.layout), 0.0, sums.voxels))
 
@@ -231,22 +268,32 @@ def make_transport(
 
     **Raises** `ValueError` where rays along a periodic axis never end.
     """
+    # What no parameter moves is worked out now, even while JAX stages the rest.
+    late = checks.is_traced(jnp.zeros(())) and not checks.is_traced((extinction, albedo))
+    with jax.ensure_compile_time_eval() if late else nullcontext():
+        return _make_transport(layout, quadrature, extinction, bands, beam, area, albedo)
+
+
+def _make_transport(layout: Layout, quadrature: Quadrature, extinction, bands: int, beam: bool, area, albedo) -> Transport:
     if not beam and layout.unfolding.axes:
         quadrature = quadrature.mirrored(layout.unfolding.axes)
     largest_plane = int(np.prod(sorted(layout.padded)[1:]))
-    ordinates = make_ordinates(quadrature, bands, largest_plane)
+    with jax.ensure_compile_time_eval():
+        ordinates = _mark_hits(layout, make_ordinates(quadrature, bands, largest_plane))
     padded = None if extinction is None else layout.to_padded(extinction)
-    thin = extinction is not None and bool(jnp.max(extinction) * (np.sqrt(3) * layout.spacing) <= thin_limit(extinction.dtype))
-    thick = extinction is not None and bool(jnp.max(extinction) * layout.spacing > THIN)
+    thickest = None if extinction is None else lax.stop_gradient(jnp.max(extinction)) * layout.spacing
+    # Programs differ by these: where the extinction is not known yet, by the one that always serves.
+    thin = thickest is not None and checks.surely(thickest * np.sqrt(3) <= thin_limit(thickest.dtype))
+    thick = thickest is not None and not checks.surely(thickest <= THIN)
     if 0 in layout.pad:
-        ordinates, longest = eqx.filter_jit(count_laps)(layout, ordinates, padded, _MOST_LAPS)
-        if int(longest) >= _MOST_LAPS:
+        ordinates, longest = _count_laps(layout, ordinates, lax.stop_gradient(padded), _MOST_LAPS)
+        if checks.surely(longest >= _MOST_LAPS):
             raise ValueError(
                 f"boundary: some rays are still going after {_MOST_LAPS} laps of a periodic axis; expected every ray to meet "
                 "a surface, an open side or an absorbing medium; close or open another side, or add absorption"
             )
     ones = lambda *shape: jnp.ones((bands, *shape), layout.plane.dtype)
-    transport = Transport(layout, _mark_hits(layout, ordinates), padded, ones(), ones(), ones(), thin, thick and not beam)
+    transport = Transport(layout, ordinates, padded, ones(), ones(), ones(), thin, thick and not beam)
     sums = _furnace(transport, Light(ones(layout.elements), None if extinction is None else ones(*layout.shape)))
     assert sums.voxels is not None
     fields = {"element_sums": sums.elements, "voxel_sums": sums.voxels, "coverage": sums.voxels[0]}

@@ -8,7 +8,9 @@ Public name: `render`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -26,6 +28,8 @@ def render(
 ) -> Float[np.ndarray, "height width *bands"]:
     """The picture of a solution that `camera` takes: radiance in W m^-2 sr^-1, float32, row 0 as the camera says.
 
+    Where JAX differentiates the solution, the picture is a JAX array of its dtype.
+
     `samples` rays a pixel, a square number: 1 is quick, 4 has smooth edges, 16 is fine. `progress`, if given, is called
     with the share that is done, in (0, 1], from time to time.
 
@@ -39,13 +43,15 @@ def render(
     if eye is not None:
         check_outside(solution.scene, "camera", np.asarray([eye]))
     field, bands = light_field(solution), solution.scene.bands
-    picture = np.zeros((height, width, bands), np.float32)
+    traced, parts = checks.is_traced(solution), []
     rows = max(1, _RAYS // (width * samples))
     for start in range(0, height, rows):
         stop = min(start + rows, height)
         origins, directions = camera.rays(samples, (start, stop))
         seen = in_blocks(radiance_along, field, (origins.reshape(-1, 3), directions.reshape(-1, 3)))
-        picture[start:stop] = np.asarray(seen).reshape(stop - start, width, samples, bands).mean(2)
+        shape = (stop - start, width, samples, bands)
+        parts.append(seen.reshape(shape).mean(2) if traced else np.asarray(seen).reshape(shape).mean(2).astype(np.float32))
         if progress is not None:
             progress(stop / height)
+    picture: Any = jnp.concatenate(parts) if traced else np.concatenate(parts)
     return picture if solution.scene.banded else picture[..., 0]

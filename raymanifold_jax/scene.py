@@ -27,6 +27,7 @@ from jaxtyping import Float, Int
 from . import checks
 from .lattice import Lattice
 from .shapes import Shape, safe_norm
+from .texture import Texture
 
 
 @jax.tree_util.register_static
@@ -50,32 +51,32 @@ class Solid(eqx.Module):
     **Arguments:**
 
     - `shape`: where it is.
-    - `albedo`: Lambertian reflectance in [0, 1], () or (bands,).
+    - `albedo`: Lambertian reflectance in [0, 1], () or (bands,), or a `Texture` of it.
     - `emission`: radiance its surface emits, >= 0, () or (bands,).
     """
 
     shape: Shape
-    albedo: Float[jax.Array, "..."]
+    albedo: Float[jax.Array, "..."] | Texture
     emission: Float[jax.Array, "..."]
 
     def __init__(self, shape: Shape, albedo: Any = 0.5, emission: Any = 0.0):
         checks.instance("shape", shape, Shape, "pass a shape such as Sphere((0.5, 0.5, 0.5), 0.2)")
         self.shape = shape
-        self.albedo = _banded("albedo", checks.in_unit_interval("albedo", albedo))
+        self.albedo = _albedo(albedo)
         self.emission = _banded("emission", checks.non_negative("emission", emission))
 
 
 class Wall(eqx.Module):
     """A side of the domain closed by a Lambertian wall, on its inner face.
 
-    **Arguments:** `albedo` in [0, 1] and `emission` (emitted radiance) >= 0, each () or (bands,).
+    **Arguments:** `albedo` in [0, 1] and `emission` (emitted radiance) >= 0, each () or (bands,), or the albedo a `Texture`.
     """
 
-    albedo: Float[jax.Array, "..."]
+    albedo: Float[jax.Array, "..."] | Texture
     emission: Float[jax.Array, "..."]
 
     def __init__(self, albedo: Any = 0.5, emission: Any = 0.0):
-        self.albedo = _banded("albedo", checks.in_unit_interval("albedo", albedo))
+        self.albedo = _albedo(albedo)
         self.emission = _banded("emission", checks.non_negative("emission", emission))
 
 
@@ -365,6 +366,13 @@ def _last_axis(name: str, value: Any, ranks: tuple[int, ...]) -> Iterator[tuple[
 
 def _leaf(value: checks.Numbers) -> jax.Array:
     return jnp.asarray(value, dtype=float)
+
+
+def _albedo(albedo: Any) -> Any:
+    if isinstance(albedo, Texture):
+        checks.in_unit_interval("albedo.values", albedo.values)
+        return albedo
+    return _banded("albedo", checks.in_unit_interval("albedo", albedo))
 
 
 def _banded(name: str, value: checks.Numbers) -> jax.Array:

@@ -72,7 +72,7 @@ class Solution(eqx.Module):
     - `surfaces`: positions, normals, areas, albedo, irradiance, radiosity, one row for each element.
     - `energy`: the power balance and its imbalance.
     - `error_bound`: certified: no radiosity, and no medium source times pi, is further than this from the exact solution of
-      the discrete problem (in radiosity units; rounding apart). inf where no bound is known.
+      the discrete problem (in radiosity units; rounding apart). inf where no bound is known, nan under `jit` and `vmap`.
     - `sweeps`: applications of the transport operator on the full lattice. `history`: the largest residual after each
       sweep, in radiosity units. `ending`: "converged", "sweep limit", "stagnated", "diverged" or "no bound"; `result`: the same
       in a sentence, with advice; `converged`: whether the bound met the tolerance; `solver`: which one it was.
@@ -157,6 +157,8 @@ class Solution(eqx.Module):
     def result(self) -> str:
         """How the iteration ended."""
         bound, target, count = self.error_bound, self.target, self.sweeps
+        if np.isnan(bound):
+            return "solved inside a program that JAX traced (jit, vmap), which keeps no bound"
         if self.converged:
             text = f"converged: error bound {bound:.3g} is within the target {target:.3g} after {count} sweeps ({self.solver})"
             rounding = f"; rounding may add up to {self.rounding:.3g}: enable float64 if that matters"

@@ -10,28 +10,31 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from . import checks
 from .acceleration import make_diffusion
 from .checkpoint import Checkpoint
 from .direct import first_flight, sky_radiance
+from .implicit import Unwatched, attach, stop_gradient
 from .iteration import Iteration, System, certify
-from .layout import make_layout
 from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
 from .optimistix_solver import OptimistixFixedPoint
+from .prepare import Prepared, prepare
 from .progress import Progress, make_progress
 from .quadrature import Quadrature, for_scene
 from .scene import OPEN, PointLight, Scene, Sky, Sun
 from .solution import Energy, Solution, _Hidden
 from .solvers import Anderson, Jacobi, Krylov, automatic
 from .source_checks import check_sources
-from .surfaces import Surfaces, find_surfaces
+from .surfaces import Surfaces
 from .transport.characteristic import Characteristic
 from .transport.light_ray_cube import LightRayCube
 from .transport.ray_cube_system import CubeSystem, make_cube_system
@@ -48,8 +51,13 @@ def solve(
     progress: bool | Progress | None = None,
     mesh: None = None,
     checkpoint: Checkpoint | None = None,
+    prepared: Prepared | None = None,
 ) -> Solution:
     """Solve a scene for the light everywhere.
+
+    JAX differentiates the solution in every physical value of the scene, forwards and backwards, at about the cost of one more
+    solve (`implicit`); shapes, and directions and positions of lights, have no derivative. Under `jit` and `vmap` no error
+    bound is known (`Solution.error_bound` is nan), and emission that is traced is swept, in compact parts too.
 
     **Arguments:**
 
@@ -65,59 +73,84 @@ def solve(
       straight from the sources, and k bounces. With `throw`, that raises `RuntimeError`; without, read
       `Solution.converged` and `Solution.result`.
     - `checkpoint`: an `rm.Checkpoint`, in which the iteration keeps its state, and from which it may go on.
+    - `prepared`: what `prepare(scene)` gave for a scene of the same shapes, lattice and kinds of sides, to save time; pass
+      the same `quadrature` each time as well.
     - `progress`: True or None shows a bar on a terminal when the solve takes long; False never; or a `Progress`.
 
-    **Raises** `ValueError` or `TypeError` for unusable arguments before any work, `RuntimeError` with `throw`.
+    **Raises** `ValueError` or `TypeError` for unusable arguments, traced shapes among them, before any work; `RuntimeError`
+    with `throw`.
     """
-    _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint)
+    _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint, prepared)
     cube = scheme if isinstance(scheme, LightRayCube) else None
     quadrature = for_scene(scene) if quadrature is None else quadrature
     check_memory(scene.lattice.shape, scene.bands, len(quadrature), scene.medium is not None)
     meter = make_progress(progress)
     with meter:
         meter.start(f"solve {scene.summary()}")
-        surfaces = find_surfaces(scene)
-        check_sources(scene, surfaces)
+        prepared = prepare(scene) if prepared is None else prepared
+        surfaces = prepared.surfaces
+        with jax.ensure_compile_time_eval():  # of what is known while JAX stages the rest
+            check_sources(scene, surfaces)
         stuff = materials(scene, surfaces)
         _check_steady(scene, surfaces, stuff)
         nodes = None if cube is None else make_cube_system(scene, surfaces, cube)
         if nodes is not None:
             system, quadrature = nodes.system, nodes.quadrature
         else:
-            layout = make_layout(scene, surfaces)
             area = surfaces.area if _exchanges(scene, stuff) else None
-            transport = make_transport(
-                layout, quadrature, stuff.extinction, scene.bands, area=area, albedo=stuff.scattering_albedo
-            )
-            system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff))
-            system = dataclasses.replace(system, near=make_diffusion(transport, surfaces, stuff))
-        if isinstance(solver, str):
-            solver = automatic(system, _depth(scene, stuff)) if nodes is None else Jacobi()
-        iteration = Iteration(system, certify(system), float(rtol), max_sweeps, meter)
-        if checkpoint is not None:
-            iteration.resume(checkpoint)
-        solver.run(iteration)
+            albedo = stuff.scattering_albedo
+            make = lambda: make_transport(prepared.layout, quadrature, stuff.extinction, scene.bands, area=area, albedo=albedo)
+            key = (id(quadrature), scene.bands, area is None)
+            transport = prepared.transport(key, (stuff.extinction, albedo), make, quadrature)
+            system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff, prepared))
+        iteration, solver = _iterate(
+            system, surfaces if nodes is None else None, float(rtol), solver, max_sweeps, meter, checkpoint
+        )
         solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes, solver)
     if throw and not solution.converged:
         raise RuntimeError(f"solve: {solution.result}")
     return solution
 
 
-def _depth(scene: Scene, stuff: Materials) -> float:
+def _iterate(
+    system: Any, surfaces: Surfaces | None, rtol: float, solver: Any, most: int, meter: Progress, checkpoint: Checkpoint | None
+) -> tuple[Iteration | Unwatched, Any]:
+    """The iteration when it is over, and the solver it was left to. `surfaces` is None in the paper's scheme."""
+    traced = checks.is_traced(system)
+    known = stop_gradient(system) if traced else system
+    if checks.is_traced(known):
+        iteration, near = Unwatched(system, rtol, most), None
+        solver = iteration.solver
+    else:
+        near = None if surfaces is None else make_diffusion(known.transport, surfaces, known.materials)
+        known = known if near is None else dataclasses.replace(known, near=near)
+        if isinstance(solver, str):
+            solver = Jacobi() if near is None else automatic(known, _depth(known.materials, known.transport.layout.spacing))
+        iteration = Iteration(known, certify(known), rtol, most, meter)
+        if checkpoint is not None:
+            iteration.resume(checkpoint)
+        solver.run(iteration)
+    if traced:
+        iteration.system = dataclasses.replace(system, near=near)
+        iteration.arriving = attach(iteration.system, iteration.arriving, rtol, most)
+    return iteration, solver
+
+
+def _depth(stuff: Materials, spacing: float) -> float:
     """The largest optical depth along an axis of the lattice, or a little more."""
     if stuff.extinction is None:
         return 0.0
     along = [float(jnp.max(jnp.sum(stuff.extinction, axis))) for axis in (1, 2, 3)]
-    return max(along) * scene.lattice.spacing
+    return max(along) * spacing
 
 
 def _exchanges(scene: Scene, stuff: Materials) -> bool:
     """Whether anything sends light through the sweeps of the solve: else nothing needs balancing."""
     fields = (stuff.albedo, stuff.emission, stuff.scattering_albedo, stuff.medium_source)
-    return any(isinstance(light, Sky) for light in scene.lights) or any(bool(jnp.any(f > 0)) for f in fields if f is not None)
+    return any(isinstance(light, Sky) for light in scene.lights) or any(map(checks.may_differ_from_zero, fields))
 
 
-def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint) -> None:
+def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint, prepared) -> None:
     checks.instance("scene", scene, Scene, "make one with rm.Scene(lattice, solids=[...], ...)")
     if quadrature is not None:
         checks.instance("quadrature", quadrature, Quadrature, "use rm.quadrature.fibonacci(200)")
@@ -129,6 +162,14 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
     if isinstance(scheme, LightRayCube) and quadrature is not None:
         got = f"{quadrature} with {scheme}"
         checks.fail("quadrature", got, "None", "the light ray cube has its own directions: leave quadrature out")
+    geometry: list[Any] = [solid.shape for solid in scene.solids]
+    geometry += [getattr(light, name, None) for light in scene.lights for name in ("direction", "position", "hemisphere")]
+    if checks.is_traced(geometry):
+        expected = "shapes and directions of lights that JAX does not trace"
+        advice = "close over the scene, and put parameters in with equinox.tree_at: what is in front of what has no derivative"
+        checks.fail("scene", "traced geometry", expected, advice, TypeError)
+    if isinstance(scheme, LightRayCube) and checks.is_traced(scene):
+        checks.fail("scheme", f"{scheme} with traced values", "rm.Characteristic()", "only its sweeps have derivatives")
     if not (isinstance(solver, Jacobi | Krylov | Anderson | OptimistixFixedPoint) or solver == "auto"):
         kinds = 'rm.Krylov(), rm.Anderson(), rm.OptimistixFixedPoint(...), rm.Jacobi() or "auto"'
         checks.fail("solver", repr(solver), kinds, 'leave it at "auto"')
@@ -136,6 +177,11 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
         checks.fail("mesh", repr(mesh), "None", "sweeps run on one device so far; leave mesh out")
     if checkpoint is not None:
         checks.instance("checkpoint", checkpoint, Checkpoint, 'pass rm.Checkpoint("run.npz")')
+    if prepared is not None:
+        checks.instance("prepared", prepared, Prepared, "pass what prepare(scene) returns")
+        if prepared.layout.shape != scene.lattice.shape:
+            got = f"what was prepared for {prepared.layout.shape} voxels"
+            checks.fail("prepared", got, f"the scene's {scene.lattice.shape}", "prepare the scene itself")
     checks.positive_int("max_sweeps", max_sweeps)
     finest = 16 * float(jnp.finfo(jnp.zeros(0).dtype).eps)
     if not (isinstance(rtol, (int, float, np.floating)) and math.isfinite(rtol) and finest <= rtol < 1):
@@ -166,13 +212,13 @@ def _finish(
     surfaces: Surfaces,
     quadrature: Quadrature,
     stuff: Materials,
-    iteration: Iteration,
+    iteration: Iteration | Unwatched,
     nodes: CubeSystem | None,
     solver: object,
 ) -> Solution:
     system, bounced = iteration.system, iteration.arriving
     # Within its bound a Krylov iterate may dip below 0, where the exact solution is not.
-    bounced = jax.tree.map(lambda x: jnp.maximum(x, 0.0), bounced)
+    bounced = jax.tree.map(lambda x: x + lax.stop_gradient(jnp.maximum(-x, 0.0)), bounced)
     if not system.scatters:  # the iteration did not need the light in the voxels
         everywhere = system.transport(system.materials.reflected(system.source + bounced), fluence=True)
         bounced = Light(bounced.elements, everywhere.voxels)

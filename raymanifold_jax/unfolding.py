@@ -112,19 +112,26 @@ def box_span(scene: Scene, u: Array, w: Array) -> tuple[Array, Array]:
 def in_blocks(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
     """function(scene, *arrays) for arrays (n, ...), some rays at a time; results have n as their first axis."""
     real = jnp.zeros(0).dtype
-    if checks.is_traced((scene, arrays)):
+    if checks.is_traced(arrays):
         return _in_bundles(function, scene, tuple(jnp.asarray(a, real) for a in arrays))
     count = len(arrays[0])
     # Few sizes, each compiled once: powers of two, then whole blocks.
     block = min(_BLOCK, max(64, 1 << (max(count, 1) - 1).bit_length()))
     arrays = tuple(_padded(np.asarray(a, real), block, np) for a in arrays)
-    parts = [_jitted(function, scene, tuple(a[i : i + block] for a in arrays)) for i in range(0, len(arrays[0]), block)]
+    call = _jitted_again if checks.is_traced(scene) else _jitted
+    parts = [call(function, scene, tuple(a[i : i + block] for a in arrays)) for i in range(0, len(arrays[0]), block)]
     return jax.tree.map(lambda *r: jnp.concatenate(r)[:count], *parts)
 
 
 @eqx.filter_jit
 def _jitted(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
     return _in_bundles(function, scene, arrays)
+
+
+@eqx.filter_jit
+def _jitted_again(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
+    """The same for derivatives: what rays meet is worked out again backwards, not kept."""
+    return _in_bundles(jax.checkpoint(function), scene, arrays)  # pyright: ignore[reportPrivateImportUsage]
 
 
 def _in_bundles(function: Callable, scene: Any, arrays: tuple[Array, ...]) -> Any:

@@ -11,7 +11,8 @@ directions instead, of the radiance that rays from x collect in it: nothing is s
 of a part; coordinates are unfolded (see `unfolding`).
 
 A part is a set of emitting voxels that touch. Large ones are left to the sweeps, which have rays enough through them; so are
-those next to surfaces of solids, or between two mirrors or periodic sides, with images without end.
+those next to surfaces of solids, or between two mirrors or periodic sides, with images without end. JAX differentiates their
+light in the values of a medium; which voxels emit has no derivative.
 
 Public: `VolumeSources`, `compact_sources`, `volume_light`, `emission_of`, `with_emission`.
 """
@@ -20,11 +21,12 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 from scipy import ndimage
 
@@ -35,6 +37,8 @@ from .scene import Scene
 from .surfaces import Surfaces
 from .trace import trace_rays, visible_unfolded
 from .unfolding import Axis, in_blocks, sloped, to_scene, unfolded_axes
+
+Numbers = np.ndarray | Array
 
 _PARTS = 16
 _GAUSS = 0.5 / math.sqrt(3)  # of a block's side, from its middle
@@ -47,12 +51,12 @@ _OFF = 2e-3  # voxels: how far off a surface rays start
 class Part(NamedTuple):
     """Emitting voxels that touch, with their images; positions in unfolded voxel coordinates."""
 
-    emission: Float[np.ndarray, "C nx ny nz"]  # theirs alone, W m^-3 sr^-1
+    emission: Numbers  # theirs alone, W m^-3 sr^-1: (C, nx, ny, nz)
     lower: Float[np.ndarray, "images 3"]
     upper: Float[np.ndarray, "images 3"]
     reach: float  # voxels: what is nearer to a box than this is near
     points: Float[np.ndarray, "m 3"]
-    power: Float[np.ndarray, "C m"]  # emission times volume, in voxels' sides cubed
+    power: Numbers  # (C, m): emission times volume, in voxels' sides cubed
 
     def near(self, u: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, " n"]:
         outside = np.maximum(self.lower - u[:, None], u[:, None] - self.upper).max(-1)
@@ -63,38 +67,45 @@ class VolumeSources(NamedTuple):
     """The compact emitting parts of a scene's medium."""
 
     parts: tuple[Part, ...]
-
-    @property
-    def emission(self) -> Float[np.ndarray, "C nx ny nz"]:
-        return np.sum([part.emission for part in self.parts], axis=0)
+    emits: Bool[np.ndarray, "nx ny nz"]  # theirs; what other voxels may emit is left to the sweeps
 
 
 def compact_sources(scene: Scene, surfaces: Surfaces, blocks: int = 1) -> VolumeSources | None:
     """The compact parts, cut into up to `blocks` blocks for every one that they are cut into for whole lattices of points.
 
-    None if there are none, or if emission is being differentiated (the sweeps carry it then).
+    None if there are none, or if emission is not known while JAX stages a program (the sweeps carry it then).
     """
-    if scene.medium is None or checks.is_traced(scene.medium):
+    if scene.medium is None:
         return None
-    emission, axes = np.asarray(emission_of(scene), np.float64), unfolded_axes(scene)
-    if not emission.any() or not all(math.isfinite(axis.upper) for axis in axes):
+    values, axes = emission_of(scene), unfolded_axes(scene)
+    known = lax.stop_gradient(values)
+    if checks.is_traced(known) or not all(math.isfinite(axis.upper) for axis in axes):
         return None
-    emission = np.where(surfaces.solid, 0.0, emission)
+    emission = np.where(surfaces.solid, 0.0, np.asarray(known, np.float64))
+    if not emission.any():
+        return None
     at_solids = np.zeros(scene.lattice.shape, bool)
     at_solids[tuple(surfaces.voxel[surfaces.side < 0].T)] = True
     label = np.zeros(scene.lattice.shape, np.int32)
     count = int(ndimage.label(emission.any(0), output=label))  # pyright: ignore
     if count > _PARTS or (at_solids & (label > 0)).any():
         return None
+    values = values if checks.is_traced(values) else emission
+    xp = _numpy(values)
     boxes = ndimage.find_objects(label)
-    parts = tuple(_part(axes, np.where(label == i + 1, emission, 0.0), box, blocks) for i, box in enumerate(boxes))
+    parts = tuple(_part(axes, xp.where(label == i + 1, values, 0.0), box, blocks) for i, box in enumerate(boxes))
     u = np.moveaxis(np.indices(scene.lattice.shape), 0, -1).reshape(-1, 3) + 0.5
     near = np.stack([part.near(u) for part in parts], 1)
     rays = near.any(1).mean() * _RAYS + (1 - near.mean(0)) @ [len(part.points) for part in parts] / blocks**3
-    return VolumeSources(parts) if rays <= _MOST_RAYS else None
+    return VolumeSources(parts, label > 0) if rays <= _MOST_RAYS else None
 
 
-def _part(axes: tuple[Axis, ...], emission: np.ndarray, box: tuple[slice, ...], blocks: int) -> Part:
+def _numpy(values: Any) -> Any:
+    """JAX's for what it differentiates; known numbers stay in numpy, in double precision."""
+    return jnp if checks.is_traced(values) else np
+
+
+def _part(axes: tuple[Axis, ...], emission: Numbers, box: tuple[slice, ...], blocks: int) -> Part:
     ends = [(s.start, s.stop) for s in box]
     mirrors = [_mirror(axis) for axis in axes]
     touches = [m is not None and m in e for m, e in zip(mirrors, ends, strict=True)]
@@ -102,9 +113,8 @@ def _part(axes: tuple[Axis, ...], emission: np.ndarray, box: tuple[slice, ...], 
     # Two blocks along the whole of it, of which one is an image's where it touches a mirror.
     side = max(whole) / 2
     number = [max(1, round(blocks * (b - a) / side)) for a, b in ends]
-    fine = max(
-        math.ceil(n / (b - a)) for n, (a, b) in zip(number, ends, strict=True)
-    )  # voxels are cut where blocks are smaller
+    # Voxels are cut where blocks are smaller.
+    fine = max(math.ceil(n / (b - a)) for n, (a, b) in zip(number, ends, strict=True))
     inside = emission[(slice(None), *box)]
     for axis in range(3):
         inside = inside.repeat(fine, axis + 1)
@@ -118,14 +128,15 @@ def _part(axes: tuple[Axis, ...], emission: np.ndarray, box: tuple[slice, ...], 
         found = _block_points(inside[(slice(None), *block)], block)
         points.append(lowest + found[0] / fine)
         power.append(found[1] / fine**3)
-    position, strength = np.concatenate(points), np.concatenate(power, -1)
+    xp = _numpy(emission)
+    position, strength = np.concatenate(points), xp.concatenate(power, -1)
     lower, upper = (np.array([e[i] for e in ends], float)[None] for i in range(2))
     for axis, mirror in enumerate(mirrors):
         if mirror is not None:
             flip = lambda u, axis=axis, mirror=mirror: np.where(np.arange(3) == axis, 2 * mirror - u, u)
             swapped = np.minimum(flip(lower), flip(upper)), np.maximum(flip(lower), flip(upper))
             lower, upper = np.concatenate([lower, swapped[0]]), np.concatenate([upper, swapped[1]])
-            position, strength = np.concatenate([position, flip(position)]), np.concatenate([strength, strength], -1)
+            position, strength = np.concatenate([position, flip(position)]), xp.concatenate([strength, strength], -1)
     return Part(emission, lower, upper, side, position, strength)
 
 
@@ -134,17 +145,17 @@ def _mirror(axis: Axis) -> int | None:
     return {"lower": 0, "upper": axis.count}.get(axis.kind)
 
 
-def _block_points(emission: np.ndarray, block: tuple[slice, ...]) -> tuple[np.ndarray, np.ndarray]:
+def _block_points(emission: Numbers, block: tuple[slice, ...]) -> tuple[np.ndarray, Numbers]:
     """Gauss points of one block (8, 3), and their powers (C, 8), which keep the block's power and the centre of it."""
     middle = np.array([(s.start + s.stop) / 2 for s in block])
     side = np.array([s.stop - s.start for s in block])
     signs = np.array(list(itertools.product((-1, 1), repeat=3)))
     u = np.stack(np.meshgrid(*(np.arange(s.start, s.stop) + 0.5 for s in block), indexing="ij"), -1)
+    xp = _numpy(emission)
     total = emission.sum((1, 2, 3))
-    first = np.einsum("cxyz,xyzi->ci", emission, u - middle)
-    center = np.divide(first, total[:, None], out=np.zeros_like(first), where=total[:, None] > 0)
-    lean = np.clip(center / (_GAUSS * side), -1, 1)
-    share = np.prod(1 + lean[:, None] * signs, -1) / len(signs)
+    center = xp.einsum("cxyz,xyzi->ci", emission, u - middle) / xp.where(total > 0, total, 1.0)[:, None]
+    lean = xp.clip(center / (_GAUSS * side), -1, 1)
+    share = xp.prod(1 + lean[:, None] * signs, -1) / len(signs)
     return middle + _GAUSS * side * signs, total[:, None] * share
 
 
@@ -168,7 +179,7 @@ def volume_light(
     for pattern in np.unique(near, axis=0):
         (chosen,) = np.nonzero((near == pattern).all(1))
         if pattern.any():
-            emission = np.sum([p.emission for p, kept in zip(sources.parts, pattern, strict=True) if kept], axis=0)
+            emission = sum(p.emission for p, kept in zip(sources.parts, pattern, strict=True) if kept)
             found = _from_directions(scene, emission, u[chosen], None if normals is None else normals[chosen], rays)
             total = total.at[:, chosen].add(found)
     return total
@@ -192,7 +203,7 @@ def _from_points(scene: Scene, part: Part, u: np.ndarray, normal: np.ndarray | N
 
 
 @eqx.filter_jit
-def _summed(passed: Array, geometry: Array, power: np.ndarray) -> Array:
+def _summed(passed: Array, geometry: Array, power: Numbers) -> Array:
     return jnp.einsum("nmc,nm,cm->cn", passed, geometry, jnp.asarray(power, passed.dtype))
 
 
@@ -204,9 +215,7 @@ def _passed(scene: Scene, start: Array, end: Array) -> Float[Array, "n C"]:
     return through * visible_unfolded(scene, start, end)[:, None]
 
 
-def _from_directions(
-    scene: Scene, emission: np.ndarray, u: np.ndarray, normal: np.ndarray | None, rays: int
-) -> Float[Array, "C n"]:
+def _from_directions(scene: Scene, emission: Any, u: np.ndarray, normal: np.ndarray | None, rays: int) -> Float[Array, "C n"]:
     """4 pi, or with a normal pi, times the mean of the radiance that rays collect."""
     if normal is None:
         spread = np.broadcast_to(whole_sphere(rays), (len(u), rays, 3))
@@ -233,7 +242,7 @@ def emission_of(scene: Scene) -> Float[Array, "C nx ny nz"]:
     return jnp.moveaxis(jnp.broadcast_to(scene.medium.coefficients()[2], (*scene.lattice.shape, scene.bands)), -1, 0)
 
 
-def with_emission(scene: Scene, emission: Float[np.ndarray, "C nx ny nz"]) -> Scene:
+def with_emission(scene: Scene, emission: Numbers) -> Scene:
     """The scene with another emission of its medium."""
     field = jnp.moveaxis(jnp.asarray(emission), 0, -1)
     return eqx.tree_at(lambda s: s.medium.emission, scene, field if scene.banded else field[..., 0])

@@ -22,6 +22,7 @@ from ..lattice import Lattice
 from ..mesh import Mesh
 from ..scene import Medium, PointLight, Scene, Sky, Sun, Wall
 from ..shapes import Difference, Intersection, Rotated, Shape, Translated, Union
+from ..texture import Texture
 from ..voxels import Voxels
 from .exr import written_atomically
 from .scene_file import FORMAT, SHAPES, SIDES
@@ -123,7 +124,7 @@ def save_scene(
     out = [f"format = {FORMAT}"] + ([f"description = {_value(description)}"] if description else [])
     out += _block("[lattice]", {"shape": list(lattice.shape), "spacing": lattice.spacing, "origin": list(lattice.origin)})
     sides = [
-        {"albedo": _plain(side.albedo), "emission": _plain(side.emission)}
+        {"albedo": _albedo(side.albedo), "emission": _plain(side.emission)}
         if isinstance(side, Wall)
         else next(name for name, known in SIDES.items() if known is side)
         for side in scene.boundary.sides
@@ -131,7 +132,7 @@ def save_scene(
     out += _block("[boundary]", {axis: sides[2 * i : 2 * i + 2] for i, axis in enumerate("xyz")})
     for number, solid in enumerate(scene.solids):
         rows = writer.shape(solid.shape, f"solids[{number}]")
-        out += _block("[[solids]]", {**rows, "albedo": _plain(solid.albedo), "emission": _plain(solid.emission)})
+        out += _block("[[solids]]", {**rows, "albedo": _albedo(solid.albedo), "emission": _plain(solid.emission)})
     if scene.medium is not None:
         out += _block("[medium]", writer.medium(scene.medium))
     for number, light in enumerate(scene.lights):
@@ -229,6 +230,12 @@ def _camera(name: str, camera: AbstractCamera) -> dict[str, Any]:
     return (
         rows | {"kind": "orthographic"} | {key: _plain(getattr(camera, key)) for key in ("center", "direction", "up", "width")}
     )
+
+
+def _albedo(value: Any) -> Any:
+    if isinstance(value, Texture):
+        checks.fail("albedo", "a texture", "a value or one for each band", "keep textures in Python; Solution.save holds them")
+    return _plain(value)
 
 
 def _plain(value: Any) -> Any:

@@ -335,9 +335,14 @@ class _Fields(eqx.Module):
         return (self.exitance, *(() if self.source is None else (self.source,)), *(self.slopes or ()))
 
     def sending(self, sent: tuple[Array, ...]) -> _Fields:
-        """The same geometry and extinction with other light."""
-        source = None if self.source is None else sent[1]
-        return dataclasses.replace(self, exitance=sent[0], source=source, slopes=self.slopes and sent[2:])
+        """The same geometry with other light and, if it comes last, other extinction."""
+        if self.source is None:
+            return dataclasses.replace(self, exitance=sent[0])
+        end = 2 + len(self.slopes or ())
+        extinction = sent[end] if len(sent) > end else self.extinction
+        return dataclasses.replace(
+            self, exitance=sent[0], source=sent[1], slopes=self.slopes and sent[2:end], extinction=extinction
+        )
 
 
 def _chords(own: Ordinates, step: Int[Array, ""], width: int, wrap_v: bool) -> Chords:

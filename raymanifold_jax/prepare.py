@@ -1,0 +1,52 @@
+"""What solves of one geometry share: surfaces, their layout, and sweeps through a medium that stays the same.
+
+Finding the surfaces, marking which rays hit them and balancing the exchange take as long as some sweeps each. A fit solves the
+same geometry with other values many times, and does this once.
+
+Public: `prepare`, `Prepared`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+from typing import Any
+
+import jax
+import numpy as np
+
+from . import checks
+from .layout import Layout, make_layout
+from .scene import Scene
+from .surfaces import Surfaces, find_surfaces
+
+
+class Prepared:
+    """Surfaces and layout of a geometry; `transport` keeps what was made for a medium while that stays the same."""
+
+    def __init__(self, surfaces: Surfaces, layout: Layout):
+        self.surfaces, self.layout = surfaces, layout
+        self._kept: dict[Hashable, tuple[list[np.ndarray], Any, Any]] = {}
+
+    def transport(self, key: Hashable, medium: Any, make: Callable[[], Any], alive: Any = None) -> Any:
+        """`make()`, or what it gave before for the same `key` and equal arrays of the `medium`.
+
+        `alive` is kept as well: an object whose id is part of the key.
+        """
+        if checks.is_traced(medium):
+            return make()
+        now = [np.asarray(leaf) for leaf in jax.tree.leaves(medium)]
+        before, kept, _ = self._kept.get(key, ([], None, None))
+        same = len(now) == len(before) and all(map(np.array_equal, now, before))
+        if kept is None or not same:
+            kept = make()
+            if not checks.is_traced(kept):
+                self._kept[key] = now, kept, alive
+        return kept
+
+
+def prepare(scene: Scene) -> Prepared:
+    """Sample the geometry of a scene; its values are not looked at."""
+    # Known even while JAX traces values.
+    with jax.ensure_compile_time_eval():
+        surfaces = find_surfaces(scene)
+        return Prepared(surfaces, make_layout(scene, surfaces))

@@ -1,0 +1,30 @@
+"""The notebooks run from top to bottom, at a small size."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
+pytestmark = pytest.mark.skipif(not NOTEBOOKS.is_dir(), reason="notebooks come with a checkout only")
+
+
+def run(name, monkeypatch):
+    """Run all code cells in one namespace, and return it."""
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("Agg")
+    monkeypatch.setenv("RAYMANIFOLD_SMALL", "1")
+    names: dict = {}
+    for number, cell in enumerate(json.loads((NOTEBOOKS / name).read_text())["cells"]):
+        if cell["cell_type"] == "code":
+            exec(compile("".join(cell["source"]), f"{name}[{number}]", "exec"), names)
+    return names
+
+
+@pytest.mark.slow
+def test_fit_albedo(monkeypatch):
+    # Of the 4 x 4 texture each cell has some 100 pixels with 1 % noise; 12 voxels a side do not matter, being the truth's too.
+    names = run("fit_albedo.ipynb", monkeypatch)
+    assert np.sqrt(np.mean(names["error"] ** 2)) < 0.01
+    assert names["difference"] == pytest.approx(float(names["gradient"][names["at"]]), rel=0.02)
