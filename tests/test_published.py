@@ -21,7 +21,7 @@ def readings(name: str, size: int, directions: int | None = None) -> dict[str, p
     ("name", "size", "quantity", "worst"),
     [
         ("kobayashi-1i", 10, "fluence", 0.005),
-        ("crosbie-schrenker", 16, "source", 0.003),
+        pytest.param("crosbie-schrenker", 16, "source", 0.003, marks=pytest.mark.slow),
         pytest.param("burns-christon", 21, "div q", 0.004, marks=pytest.mark.slow),
         pytest.param("disort-1f", 32, "leaving", 0.002, marks=pytest.mark.slow),
         pytest.param("disort-1f", 32, "all levels", 0.002, marks=pytest.mark.slow),
