@@ -71,6 +71,7 @@ def _kobayashi_case(number: int, case: str) -> Case:
         sizes=(10, 30, 50),
         targets=same(fluence=target),
         directions=200 if case == "i" else 400,
+        rtol=5e-6,  # of the source, which is some 10^4 times as bright as the far end of the duct
     )
 
 
