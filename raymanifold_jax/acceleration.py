@@ -65,25 +65,27 @@ def _level(links: list[Array], loss: Array) -> _Level:
     return _Level((links[0], links[1], links[2]), loss, _DAMPING / diagonal)
 
 
+class _Second(NamedTuple):
+    """The second step, where sources have slopes."""
+
+    levels: tuple[_Level, ...]
+    kept: Float[Array, "C nx ny nz"]  # weight of what a voxel has from the first
+    bend: Float[Array, "C E"]  # conductance to the elements
+
+
 class Diffusion(eqx.Module):
     """M of the module's docstring, for one scene and its albedos."""
 
     levels: tuple[_Level, ...]
-    sloped: tuple[_Level, ...] | None  # of the second step
-    weight: Float[Array, "C nx ny nz"]  # what a voxel keeps in it
+    second: _Second | None
     power: Light  # g
     albedo: Light  # R
     probe: Int[Array, " E"]  # the voxel each element hangs on, flat
     coupling: Float[Array, "C E"]  # k
-    bend: Float[Array, "C E"]  # the same in the second step
 
     def __call__(self, leaving: Light) -> Light:
         """M applied to what leaves: about the solution of (I - K) x = leaving."""
         return _precondition(self, leaving)
-
-    def transposed(self, light: Light) -> Light:
-        """M' = I + g A^-1 R."""
-        return _transposed(self, light)
 
     def of_arriving(self, light: Light) -> Light:
         """The same where bounces take arriving light to arriving light: I + A^-1 g R."""
@@ -98,12 +100,6 @@ class Diffusion(eqx.Module):
 def _precondition(near: Diffusion, leaving: Light) -> Light:
     weighted = jax.tree.map(jnp.multiply, near.power, leaving)
     return leaving + jax.tree.map(jnp.multiply, near.albedo, _spread(near, weighted))
-
-
-@eqx.filter_jit
-def _transposed(near: Diffusion, light: Light) -> Light:
-    weighted = jax.tree.map(jnp.multiply, near.albedo, light)
-    return light + jax.tree.map(jnp.multiply, near.power, _spread_transposed(near, weighted))
 
 
 @eqx.filter_jit
@@ -123,9 +119,9 @@ def _spread(near: Diffusion, sent: Light) -> Light:
     into = _gathered(near, passed * sent.elements)
     voxels = _conjugate_gradients(near.levels, into if sent.voxels is None else into + sent.voxels)
     elements = (sent.elements + near.coupling * _above(near, voxels)) / whole
-    if near.sloped is not None:
-        beside = _gathered(near, near.bend * near.albedo.elements * elements)
-        voxels = _conjugate_gradients(near.sloped, near.weight * voxels + beside)
+    if near.second is not None:
+        beside = _gathered(near, near.second.bend * near.albedo.elements * elements)
+        voxels = _conjugate_gradients(near.second.levels, near.second.kept * voxels + beside)
     return Light(elements, None if sent.voxels is None else voxels)
 
 
@@ -134,10 +130,10 @@ def _spread_transposed(near: Diffusion, asked: Light) -> Light:
     whole, passed = _elimination(near)
     elements = asked.elements
     voxels = jnp.zeros_like(near.levels[0].loss) if asked.voxels is None else asked.voxels
-    if near.sloped is not None:
-        smooth = _conjugate_gradients(near.sloped, voxels)
-        voxels = near.weight * smooth
-        elements = elements + near.bend * near.albedo.elements * _above(near, smooth)
+    if near.second is not None:
+        smooth = _conjugate_gradients(near.second.levels, voxels)
+        voxels = near.second.kept * smooth
+        elements = elements + near.second.bend * near.albedo.elements * _above(near, smooth)
     elements = elements / whole
     voxels = _conjugate_gradients(near.levels, voxels + _gathered(near, near.coupling * elements))
     return Light(elements + passed * _above(near, voxels), None if asked.voxels is None else voxels)
@@ -295,14 +291,14 @@ def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodi
     # Nothing happens in voxels inside solids; and a matrix that nearly is singular must not be.
     links_of = sum((link + jnp.roll(link, 1, axis) for axis, link in enumerate(links, start=1)), start=jnp.zeros_like(loss))
     loss = jnp.where(links_of + loss > 0, loss + 8 * jnp.finfo(real).eps * links_of, 1.0)
-    weight, second = 16 * (1 / (3 * total) + (1 - straight) / 4), None
+    second = None
     if sloped:
-        held = weight.reshape(bands, -1).at[:, probe].add(beside).reshape(depth.shape)
-        second = _levels(bends, held)
+        kept = 16 * (1 / (3 * total) + (1 - straight) / 4)
+        held = kept.reshape(bands, -1).at[:, probe].add(beside).reshape(depth.shape)
+        second = _Second(_levels(bends, held), kept, beside)
     voxels = None if stuff.scattering_albedo is None else power
     return Diffusion(
-        _levels(links, loss), second, weight,
-        Light(of_elements, voxels), Light(stuff.albedo, stuff.scattering_albedo), probe, coupling, beside,
+        _levels(links, loss), second, Light(of_elements, voxels), Light(stuff.albedo, stuff.scattering_albedo), probe, coupling,
     )  # fmt: skip
 
 

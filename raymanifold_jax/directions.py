@@ -30,3 +30,10 @@ def frames(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3 3"]:
     first = np.cross(helper, normals)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
     return np.stack([first, np.cross(normals, first), normals], axis=1)
+
+
+def gathering(number: int, count: int, normals: Float[np.ndarray, "n 3"] | None) -> Float[np.ndarray, "n number 3"]:
+    """Directions to gather along from `count` points: around their normals, or without normals over the sphere."""
+    if normals is None:
+        return np.broadcast_to(whole_sphere(number), (count, number, 3))
+    return np.einsum("dj,nji->ndi", cosine_hemisphere(number), frames(normals))

@@ -24,10 +24,10 @@ from jaxtyping import Array, Float
 
 from . import checks
 from .direct import emitter_light, sky_radiance, small_emitters
-from .directions import cosine_hemisphere, frames, whole_sphere
+from .directions import gathering
 from .interpolation import ElementTable, element_table, interpolate_irradiance, slopes
 from .march import fill, interpolate, march_between, transmittance, transmittance_between
-from .scene import MIRROR, OPEN, PERIODIC, PointLight, Scene, Solid, Sun, Wall
+from .scene import MIRROR, OPEN, PERIODIC, SIDES, PointLight, Scene, Solid, Sun, Wall
 from .solution import Solution
 from .texture import Texture, value_at
 from .trace import Hit, trace_rays, visible
@@ -38,7 +38,6 @@ _OFF = 2e-3  # voxels: how far off a surface rays start
 _DEEP = 0.5  # voxels: how far inside a solid a point on its surface may be by mistake
 _POINTS = 256  # points of a final gather at once
 _BLOCKS = 5  # of a volume source, along each axis, for one of the solve's
-_SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 
 class LightField(eqx.Module):
@@ -104,7 +103,7 @@ def fluence(solution: Solution, points: Any, directions: int = 2048) -> Float[Ar
         if outside.any():
             at = int(np.argmax(outside))
             advice = "there is no medium and no voxel there: leave it out"
-            checks.fail(f"points[{at}]", points[at].tolist(), f"a point of the lattice, {_box(scene)}", advice)
+            checks.fail(f"points[{at}]", points[at].tolist(), f"a point of the lattice, {scene.lattice.box}", advice)
     check_outside(scene, "points", points)
     if number == 0:
         return _banded(scene, in_blocks(_fluence_at, light_field(solution), (points,)))
@@ -148,10 +147,7 @@ def _mean_of_rays(field: LightField, points: Any, normals: Any, number: int) -> 
     parts = []
     for i in range(0, len(points), _POINTS):
         block = points[i : i + _POINTS]
-        if normals is None:
-            rays = np.tile(whole_sphere(number), (len(block), 1))
-        else:
-            rays = np.einsum("dj,nji->ndi", cosine_hemisphere(number), frames(normals[i : i + _POINTS])).reshape(-1, 3)
+        rays = gathering(number, len(block), None if normals is None else normals[i : i + _POINTS]).reshape(-1, 3)
         xp = np if isinstance(block, np.ndarray) else jnp
         seen = in_blocks(radiance_along, field, (xp.repeat(block, number, 0), rays))
         parts.append(seen.reshape(len(block), number, -1).mean(1))
@@ -167,9 +163,9 @@ def outgoing_flux(solution: Solution, side: str) -> Float[Array, "nu nv *bands"]
     **Raises** `ValueError` for another name or a side that is not OPEN.
     """
     _check_solution(solution)
-    if side not in _SIDES:
-        checks.fail("side", repr(side), f"one of {', '.join(_SIDES)}", 'the upper side of z is "z+"')
-    number, scene, elements = _SIDES.index(side), solution.scene, solution.elements
+    if side not in SIDES:
+        checks.fail("side", repr(side), f"one of {', '.join(SIDES)}", 'the upper side of z is "z+"')
+    number, scene, elements = SIDES.index(side), solution.scene, solution.elements
     kind = scene.boundary.sides[number]
     if kind is not OPEN:
         got = f"{side}, which is {'a Wall' if isinstance(kind, Wall) else kind.name}"
@@ -367,7 +363,7 @@ def _lift(scene: Scene, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     beyond = np.maximum(-u, u - np.asarray(lattice.shape)).max(-1, initial=-np.inf)
     if len(points) and beyond.max() > _DEEP:
         at = int(np.argmax(beyond))
-        expected = f"a point of the lattice, {_box(scene)}"
+        expected = f"a point of the lattice, {scene.lattice.box}"
         checks.fail(f"points[{at}]", points[at].tolist(), expected, "there are no surfaces outside it: leave it out")
     advice = "pass points on a surface, or fluence(...) for points in space"
     _check_depth(scene, "points", points, _DEEP, "on a surface", advice)
@@ -385,7 +381,3 @@ def _lift(scene: Scene, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
 def _untraced(scene: Scene) -> Scene:
     """The same geometry, with any numbers for values that are traced."""
     return jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype) if checks.is_traced(leaf) else leaf, scene)
-
-
-def _box(scene: Scene) -> str:
-    return f"{scene.lattice.lower.tolist()} to {scene.lattice.upper.tolist()}"

@@ -34,7 +34,7 @@ from . import checks
 from .acceleration import Diffusion
 from .adjoint import linear
 from .iteration import Certificate, System
-from .krylov import linear_solve, norm
+from .krylov import dot, linear_solve, norm
 from .operator import Light, Materials, Transport
 from .solvers import Krylov
 
@@ -166,7 +166,7 @@ def _begin(right: Light, tolerance) -> tuple[_State, Array, Array]:
     largest = right.largest()
     scale = jnp.where(largest > 0, largest, 1.0)
     right = jax.tree.map(lambda x: x / scale, right)
-    length = jnp.sqrt(_dot(right, right))
+    length = jnp.sqrt(dot(right, right))
     real = right.elements.dtype
     basis = jax.tree.map(lambda x: jnp.zeros((_RESTART + 1, *x.shape), real), right)
     first = jax.tree.map(lambda b, x: b.at[0].set(x / jnp.where(length > 0, length, 1.0)), basis, right)
@@ -186,7 +186,7 @@ def _advance(state: _State, image: Light, target: Array) -> _State:
         overlap = sum(jax.tree.leaves(jax.tree.map(lambda b, x: jnp.tensordot(b, x, x.ndim), basis, vector)))
         vector = jax.tree.map(lambda b, x, overlap=overlap: x - jnp.tensordot(overlap, b, 1), basis, vector)
         column = column + overlap
-    length = jnp.sqrt(_dot(vector, vector))
+    length = jnp.sqrt(dot(vector, vector))
     inverse = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)
     basis = jax.tree.map(lambda b, x: lax.dynamic_update_index_in_dim(b, x * inverse, step + 1, 0), basis, vector)
     hessenberg = state.hessenberg.at[:, step].set(column.at[step + 1].set(length))
@@ -199,7 +199,7 @@ def _advance(state: _State, image: Light, target: Array) -> _State:
     def end(_):
         solution = jax.tree.map(lambda s, b: s + jnp.tensordot(weights, b[:-1], 1), state.solution, basis)
         vector = jax.tree.map(lambda b: jnp.tensordot(residual, b, 1), basis)
-        size = jnp.sqrt(_dot(vector, vector))
+        size = jnp.sqrt(dot(vector, vector))
         inverse = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 0.0)
         first = jax.tree.map(lambda b, x: jnp.zeros_like(b).at[0].set(x * inverse), basis, vector)
         return _State(solution, first, jnp.zeros_like(hessenberg), size, size, jnp.zeros_like(step), state.count + 1)
@@ -208,7 +208,3 @@ def _advance(state: _State, image: Light, target: Array) -> _State:
         return _State(state.solution, basis, hessenberg, state.length, left, step + 1, state.count + 1)
 
     return lax.cond(ends, end, go_on, None)
-
-
-def _dot(a: Light, b: Light) -> Array:
-    return sum(jax.tree.leaves(jax.tree.map(lambda x, y: jnp.sum(x * y), a, b)), start=jnp.zeros((), a.elements.dtype))

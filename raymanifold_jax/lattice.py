@@ -63,6 +63,11 @@ class Lattice(eqx.Module):
         return np.asarray(self.shape) * self.spacing
 
     @property
+    def box(self) -> str:
+        """The box in words, for messages."""
+        return f"{self.lower.tolist()} to {self.upper.tolist()}"
+
+    @property
     def size(self) -> int:
         """The number of voxels."""
         nx, ny, nz = self.shape

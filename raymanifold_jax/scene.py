@@ -286,7 +286,7 @@ class Scene(eqx.Module):
 
     def _band_axes(self) -> Iterator[tuple[str, int]]:
         named = [(f"solids[{i}]", solid) for i, solid in enumerate(self.solids)]
-        named += [(f"boundary {name}", side) for name, side in zip(_SIDES, self.boundary.sides, strict=True)]
+        named += [(f"boundary {name}", side) for name, side in zip(SIDES, self.boundary.sides, strict=True)]
         for name, part in named:
             if isinstance(part, Solid | Wall):
                 yield from _last_axis(f"{name}.albedo", part.albedo, (1,))
@@ -351,7 +351,7 @@ class Scene(eqx.Module):
         return ", ".join(parts) + "; sides " + ", ".join(axes)
 
 
-_SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
+SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
 
 
 def _count(number: int, noun: str) -> str:

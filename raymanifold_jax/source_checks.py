@@ -5,11 +5,10 @@ Public: `check_sources`.
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 
 from . import checks
-from .scene import OPEN, PointLight, Scene, Sun
+from .scene import OPEN, SIDES, PointLight, Scene, Sun
 from .surfaces import Surfaces
 
 
@@ -24,21 +23,22 @@ def check_sources(scene: Scene, surfaces: Surfaces) -> None:
             _check_sun(scene, f"lights[{i}]: direction", np.asarray(light.direction, float))
     found = set(np.unique(surfaces.material).tolist())
     for i, solid in enumerate(scene.solids):
-        shines = not checks.is_traced(solid.emission) and any(
-            np.any(np.asarray(e) > 0) for e in jax.tree.leaves(solid.emission)
-        )
+        shines = not checks.is_traced(solid.emission) and checks.may_differ_from_zero(solid.emission)
         if shines and i not in found:
             checks.fail(
                 f"solids[{i}]", f"an emitter ({type(solid.shape).__name__}) none of whose surface is in a voxel of the lattice",
                 "a surface in the lattice, of about a voxel at least",
-                f"move it into {_box(scene)}, make it larger than {scene.lattice.spacing:.4g}, or use rm.PointLight",
+                f"move it into {scene.lattice.box}, make it larger than {scene.lattice.spacing:.4g}, or use rm.PointLight",
             )  # fmt: skip
 
 
 def _check_point(scene: Scene, name: str, position: np.ndarray) -> None:
     if not bool(np.all(scene.lattice.contains(position[None]))):
         checks.fail(
-            name, position.tolist(), f"a point of the lattice, {_box(scene)}", "move it, enlarge the lattice, or use rm.Sun"
+            name,
+            position.tolist(),
+            f"a point of the lattice, {scene.lattice.box}",
+            "move it, enlarge the lattice, or use rm.Sun",
         )
     if scene.solids and not checks.is_traced(scene.solids):
         depth = -float(np.asarray(scene.distance(position[None].astype(np.float32)))[0])
@@ -50,14 +50,10 @@ def _check_point(scene: Scene, name: str, position: np.ndarray) -> None:
 def _check_sun(scene: Scene, name: str, direction: np.ndarray) -> None:
     faced = [side for side in range(6) if (-direction if side % 2 else direction)[side // 2] > 1e-6]
     if not any(scene.boundary.sides[side] is OPEN for side in faced):
-        sides = ", ".join("xyz"[side // 2] + "-+"[side % 2] for side in faced)
+        sides = ", ".join(SIDES[side] for side in faced)
         checks.fail(
             name,
             direction.tolist(),
             f"an OPEN side that it enters by ({sides})",
             "open one in Boundary(...), or leave the sun out",
         )
-
-
-def _box(scene: Scene) -> str:
-    return f"{scene.lattice.lower.tolist()} to {scene.lattice.upper.tolist()}"

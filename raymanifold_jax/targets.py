@@ -12,7 +12,7 @@ Public: `Target`, `PictureTarget`, `IrradianceTarget`, `FluenceTarget`.
 from __future__ import annotations
 
 import abc
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -31,6 +31,7 @@ from .solution import Solution
 class Target(eqx.Module):
     """Measured values, and how a solution predicts them."""
 
+    rank: eqx.AbstractClassVar[int]  # axes of the values, without that of the bands
     values: eqx.AbstractVar[Float[np.ndarray, "..."]]
     weight: eqx.AbstractVar[Float[np.ndarray, "..."]]
 
@@ -38,9 +39,14 @@ class Target(eqx.Module):
     def predicted(self, solution: Solution) -> Float[jax.Array, "..."]:
         """The values that a solution gives, in the shape of `values`."""
 
-    @abc.abstractmethod
     def check(self, name: str, scene: Scene) -> None:
-        """Raise `ValueError` if the values are not of the shape that this scene's solutions give."""
+        """Raise `ValueError` if the values do not have the bands that this scene's solutions have."""
+        found = self.values.shape[self.rank] if self.values.ndim > self.rank else None
+        expected = scene.bands if scene.banded else None
+        if found != expected:
+            word = lambda bands: "no band axis" if bands is None else f"{bands} bands"
+            advice = "convert the picture to the scene's bands"
+            checks.fail(name, f"values with {word(found)}", f"{word(expected)}, as the scene", advice)
 
     def residuals(self, solution: Solution) -> Float[jax.Array, " n"]:
         """sqrt(weight) (predicted - measured), flat."""
@@ -56,6 +62,7 @@ class PictureTarget(Target):
     picture does not count. `samples`: rays a pixel, as for `render`.
     """
 
+    rank: ClassVar[int] = 2
     camera: AbstractCamera
     values: Float[np.ndarray, "height width *bands"]
     weight: Float[np.ndarray, "height width *bands"]
@@ -81,13 +88,11 @@ class PictureTarget(Target):
     def predicted(self, solution: Solution) -> Float[jax.Array, "height width *bands"]:
         return jnp.asarray(render(solution, self.camera, self.samples))
 
-    def check(self, name: str, scene: Scene) -> None:
-        _check_bands(name, self.values, 2, scene)
-
 
 class IrradianceTarget(Target):
     """Irradiance measured at surface points, (n[, bands]); `points` and `normals` as for `irradiance`."""
 
+    rank: ClassVar[int] = 1
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
     values: Float[np.ndarray, "n *bands"]
@@ -103,13 +108,11 @@ class IrradianceTarget(Target):
     def predicted(self, solution: Solution) -> Float[jax.Array, "n *bands"]:
         return irradiance(solution, self.points, self.normals, self.directions)
 
-    def check(self, name: str, scene: Scene) -> None:
-        _check_bands(name, self.values, 1, scene)
-
 
 class FluenceTarget(Target):
     """Fluence measured at points in space, (n[, bands]); `directions` as for `fluence`."""
 
+    rank: ClassVar[int] = 1
     points: Float[np.ndarray, "n 3"]
     values: Float[np.ndarray, "n *bands"]
     weight: Float[np.ndarray, "n *bands"]
@@ -123,9 +126,6 @@ class FluenceTarget(Target):
 
     def predicted(self, solution: Solution) -> Float[jax.Array, "n *bands"]:
         return fluence(solution, self.points, self.directions)
-
-    def check(self, name: str, scene: Scene) -> None:
-        _check_bands(name, self.values, 1, scene)
 
 
 def _one_each(values: Any, points: np.ndarray) -> np.ndarray:
@@ -146,13 +146,3 @@ def _weight(weight: Any, mask: Any, values: np.ndarray) -> np.ndarray:
     if not full.any():
         checks.fail("weight", "zeros, or a mask that leaves nothing", "some value that counts", "leave the target out")
     return full
-
-
-def _check_bands(name: str, values: np.ndarray, rank: int, scene: Scene) -> None:
-    found = values.shape[rank] if values.ndim > rank else None
-    expected = scene.bands if scene.banded else None
-    if found != expected:
-        word = lambda bands: "no band axis" if bands is None else f"{bands} bands"
-        checks.fail(
-            name, f"values with {word(found)}", f"{word(expected)}, as the scene", "convert the picture to the scene's bands"
-        )

@@ -31,7 +31,7 @@ from jaxtyping import Array, Bool, Float
 from scipy import ndimage
 
 from . import checks
-from .directions import cosine_hemisphere, frames, whole_sphere
+from .directions import gathering
 from .march import march_between, transmittance_between
 from .scene import Scene
 from .surfaces import Surfaces
@@ -217,10 +217,7 @@ def _passed(scene: Scene, start: Array, end: Array) -> Float[Array, "n C"]:
 
 def _from_directions(scene: Scene, emission: Any, u: np.ndarray, normal: np.ndarray | None, rays: int) -> Float[Array, "C n"]:
     """4 pi, or with a normal pi, times the mean of the radiance that rays collect."""
-    if normal is None:
-        spread = np.broadcast_to(whole_sphere(rays), (len(u), rays, 3))
-    else:
-        spread = np.einsum("dj,nji->ndi", cosine_hemisphere(rays), frames(normal))
+    spread = gathering(rays, len(u), normal)
     glowing = with_emission(scene, emission)
     found, block = [], max(1, _PAIRS // rays)
     for i in range(0, len(u), block):
