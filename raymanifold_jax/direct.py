@@ -228,7 +228,8 @@ def _pairs(scene: Scene, points: EmitterPoints, position, normal) -> Float[Array
     arriving = jnp.where(jnp.any(normal != 0, -1)[:, None], arriving, jnp.sqrt(squared))  # no normal: fluence
     geometry = jnp.maximum(leaving, 0.0) * jnp.maximum(arriving, 0.0) / squared**2
     starts = jnp.broadcast_to(start[:, None], to.shape).reshape(-1, 3)
-    ends = jnp.broadcast_to((end + clearance * towards)[None], to.shape).reshape(-1, 3)
+    # Points that face away need no ray: beside a flush lamp it would creep along it.
+    ends = jnp.where((geometry > 0)[..., None], (end + clearance * towards)[None], start[:, None]).reshape(-1, 3)
     seen = geometry.reshape(-1) * visible(scene, starts, ends)
     passed = seen * transmittance(scene, starts, ends)
     irradiance = jnp.einsum("cnm,cm->cn", passed.reshape(-1, *geometry.shape), points.power)

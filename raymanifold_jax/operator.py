@@ -235,7 +235,6 @@ def _unsloped(layout: Layout, slopes: tuple[Array, ...], albedo, extinction) -> 
     return jax.vjp(lambda source: _slopes(layout, source, albedo, extinction), jnp.zeros_like(albedo))[1](slopes)[0]
 
 
-_mark_hits = eqx.filter_jit(mark_hits)
 _count_laps = eqx.filter_jit(count_laps)
 
 
@@ -279,7 +278,7 @@ def _make_transport(layout: Layout, quadrature: Quadrature, extinction, bands: i
         quadrature = quadrature.mirrored(layout.unfolding.axes)
     largest_plane = int(np.prod(sorted(layout.padded)[1:]))
     with jax.ensure_compile_time_eval():
-        ordinates = _mark_hits(layout, make_ordinates(quadrature, bands, largest_plane))
+        ordinates = mark_hits(layout, make_ordinates(quadrature, bands, largest_plane))
     padded = None if extinction is None else layout.to_padded(extinction)
     thickest = None if extinction is None else lax.stop_gradient(jnp.max(extinction)) * layout.spacing
     # Programs differ by these: where the extinction is not known yet, by the one that always serves.

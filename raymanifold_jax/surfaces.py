@@ -102,23 +102,15 @@ class _DistanceField:
         # The shapes alone: albedos may be traced while a scene is being fitted, its geometry never is.
         self._shapes = tuple(scene.solids[i].shape for i in (range(len(scene.solids)) if which is None else which))
 
-        def distances(shapes, x):
-            return jnp.stack([s.distance(x) for s in shapes])
-
-        value = lambda shapes, x: distances(shapes, x[None]).min()
-        self._distance = eqx.filter_jit(lambda s, x: distances(s, x).min(0))
-        self._gradient = eqx.filter_jit(jax.vmap(jax.value_and_grad(value, argnums=1), in_axes=(None, 0)))
-        self._nearest = eqx.filter_jit(lambda s, x: jnp.argmin(distances(s, x), 0))
-
     def distance(self, points: np.ndarray) -> np.ndarray:
-        return self._batched(lambda x: self._distance(self._shapes, x), points) / self.spacing
+        return self._batched(lambda x: _least(self._shapes, x), points) / self.spacing
 
     def gradient(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        value, slope = self._batched(lambda x: self._gradient(self._shapes, x), points)
+        value, slope = self._batched(lambda x: _slope(self._shapes, x), points)
         return value / self.spacing, slope
 
     def nearest(self, points: np.ndarray) -> np.ndarray:
-        return self._batched(lambda x: self._nearest(self._shapes, x), points)
+        return self._batched(lambda x: _nearest(self._shapes, x), points)
 
     @staticmethod
     def _batched(function: Callable, points: np.ndarray, size: int = 1 << 18):
@@ -133,6 +125,28 @@ class _DistanceField:
             padded[: len(block)] = block
             parts.append(jax.tree.map(lambda a: np.asarray(a), function(jnp.asarray(padded))))
         return jax.tree.map(lambda *a: np.concatenate(a)[: len(flat)].reshape(*shape, *a[0].shape[1:]), *parts)
+
+
+# Programs that scenes of like shapes share.
+
+
+def _distances(shapes: tuple, points: jax.Array) -> jax.Array:
+    return jnp.stack([shape.distance(points) for shape in shapes])
+
+
+@eqx.filter_jit
+def _least(shapes: tuple, points: jax.Array) -> jax.Array:
+    return _distances(shapes, points).min(0)
+
+
+@eqx.filter_jit
+def _slope(shapes: tuple, points: jax.Array) -> tuple[jax.Array, jax.Array]:
+    return jax.vmap(jax.value_and_grad(lambda x: _distances(shapes, x[None]).min()))(points)
+
+
+@eqx.filter_jit
+def _nearest(shapes: tuple, points: jax.Array) -> jax.Array:
+    return jnp.argmin(_distances(shapes, points), 0)
 
 
 def _solid_elements(scene: Scene, field: _DistanceField, distance: np.ndarray) -> dict[str, np.ndarray]:

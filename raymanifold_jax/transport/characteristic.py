@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -591,33 +592,33 @@ def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinat
     neighbour's plane stands proud of a curved surface, and would darken the element.
     """
 
-    def one_axis(axis: int, own: Ordinates, reads: AxisReads) -> Ordinates:
-        if own.weight.shape[0] == 0:
-            hits, probes = (jnp.zeros((0, 1, r.cell.shape[0]), jnp.uint32) for r in reads)
-        else:
-            numbers = jnp.arange(own.weight.shape[0])
-            bits = lambda reads: lax.map(lambda chunk: _hit_bits(layout, axis, _chunk(own, chunk), reads), numbers)
-            hits, probes = bits(reads.hits), bits(reads.probes)
+    found = []
+    for axis, (own, reads) in enumerate(zip(ordinates, layout.reads, strict=True)):
+        order = AXES[axis]
+        planes = jnp.where(layout.buried, -1.0, layout.plane[0]), *(layout.plane[1 + a] for a in order)
+        geometry = tuple(_planes(field, axis) for field in planes)
+        padded = layout.pad[order[0]] > 0, layout.pad[order[1]] > 0, layout.pad[order[2]] > 0
+        bits = tuple(_hit_bits(geometry, layout.padded_along(axis), padded, own, r) for r in reads)
         empty = lambda x: x is None
-        return eqx.tree_at(lambda o: (o.hit_bits, o.probe_bits), own, (hits, probes), is_leaf=empty)
+        found.append(eqx.tree_at(lambda o: (o.hit_bits, o.probe_bits), own, bits, is_leaf=empty))
+    return tuple(found)
 
-    return tuple(one_axis(a, o, r) for a, (o, r) in enumerate(zip(ordinates, layout.reads, strict=True)))
 
-
-def _hit_bits(layout: Layout, axis: int, chunk: Ordinates, reads: Reads) -> UInt32[Array, "words M"]:
-    order = AXES[axis]
-    count, height, width = layout.padded_along(axis)
-    wrap_v = layout.pad[order[2]] == 0
-    offsets = jnp.where(layout.buried, -1.0, layout.plane[0])
-    geometry = [_planes(offsets, axis), *(_planes(layout.plane[1 + a], axis) for a in order)]
-    rim = [jnp.arange(n) for n in (count, height, width)]
-    rim = [(r == 0) | (r == r[-1]) if layout.pad[a] else r < 0 for r, a in zip(rim, order, strict=True)]
+@eqx.filter_jit  # by axis: in a cubic lattice they share a program
+def _hit_bits(
+    geometry: tuple[Array, ...], shape: tuple[int, int, int], padded: tuple[bool, ...], ordinates: Ordinates, reads: Reads
+) -> UInt32[Array, "G words M"]:
+    if ordinates.weight.shape[0] == 0:
+        return jnp.zeros((0, 1, reads.cell.shape[0]), jnp.uint32)
+    count, height, width = shape
+    rim = [jnp.arange(n) for n in shape]
+    rim = [(r == 0) | (r == r[-1]) if p else r < 0 for r, p in zip(rim, padded, strict=True)]
     ghost = (rim[0][:, None, None] | rim[1][:, None] | rim[2]).reshape(count, -1)
 
-    def one(face, home):
+    def one(chunk: Ordinates, face, home):
         plane, cell = home
         face = tuple(component[None] for component in face)
-        chords = _chords(chunk, jnp.where(chunk.sign > 0, plane, count - 1 - plane), width, wrap_v)
+        chords = _chords(chunk, jnp.where(chunk.sign > 0, plane, count - 1 - plane), width, not padded[2])
         found, clean = False, True
         for number, ends in enumerate(chords.ends):
             hit = _hit(face, ends, chords.share[number][:, None, None])[0][:, 0, 0]
@@ -639,4 +640,7 @@ def _hit_bits(layout: Layout, axis: int, chunk: Ordinates, reads: Reads) -> UInt
         flags = jnp.pad(flags, (0, -flags.shape[0] % 32)).reshape(-1, 32)
         return jnp.sum(flags << jnp.arange(32, dtype=jnp.uint32), axis=1, dtype=jnp.uint32)
 
-    return jax.vmap(one, in_axes=(0, 1), out_axes=1)(reads.plane, reads.home)
+    def of_chunk(number):
+        return jax.vmap(partial(one, _chunk(ordinates, number)), in_axes=(0, 1), out_axes=1)(reads.plane, reads.home)
+
+    return lax.map(of_chunk, jnp.arange(ordinates.weight.shape[0]))
