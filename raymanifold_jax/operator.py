@@ -26,13 +26,15 @@ from jaxtyping import Array, Float
 from . import checks
 from .lattice import Lattice
 from .layout import Layout, Ordinates, make_ordinates
+from .partition import Partition
 from .quadrature import Quadrature
 from .scene import Scene, Wall
 from .surfaces import Surfaces, patch_points
 from .texture import Texture, mean_values
-from .transport.characteristic import Inflow, count_laps, mark_hits, thin_limit
+from .transport.characteristic import Inflow, thin_limit
 from .transport.derivative import Manner, swept, unswept
-from .transport.slopes import THIN, source_slopes
+from .transport.sharded import laps_over, mark_over, plane_size, slopes_over
+from .transport.slopes import THIN
 
 _MOST_LAPS = 1 << 16
 _ROUNDS = 1  # of Sinkhorn's iteration; each halves what bias is left, or better, and costs about four sweeps
@@ -124,7 +126,7 @@ def _face_points(lattice: Lattice, surfaces: Surfaces, rows: np.ndarray) -> tupl
 class Transport(eqx.Module):
     """K without the albedos: a layout, the directions, the medium's extinction, and the sums of a uniform radiance of 1."""
 
-    layout: Layout
+    layout: Layout | Partition
     ordinates: tuple[Ordinates, ...]
     extinction: Float[Array, "C X Y Z"] | None
     element_sums: Float[Array, "C E"]
@@ -225,17 +227,17 @@ def _sweep(transport: Transport, leaving: Light, inflow: Inflow | None, fluence:
 
 
 @eqx.filter_jit
-def _slopes(layout: Layout, source, albedo, extinction) -> tuple[Array, ...]:
-    return source_slopes(layout, layout.to_padded(source), layout.to_padded(albedo), extinction)
+def _slopes(layout: Layout | Partition, source, albedo, extinction) -> tuple[Array, ...]:
+    return slopes_over(layout, source, albedo, extinction)
 
 
 @eqx.filter_jit
-def _unsloped(layout: Layout, slopes: tuple[Array, ...], albedo, extinction) -> Array:
+def _unsloped(layout: Layout | Partition, slopes: tuple[Array, ...], albedo, extinction) -> Array:
     """The transpose of `_slopes` in the source."""
     return jax.vjp(lambda source: _slopes(layout, source, albedo, extinction), jnp.zeros_like(albedo))[1](slopes)[0]
 
 
-_count_laps = eqx.filter_jit(count_laps)
+_count_laps = eqx.filter_jit(laps_over)
 
 
 def _furnace(transport: Transport, leaving: Light) -> Light:
@@ -245,12 +247,12 @@ def _furnace(transport: Transport, leaving: Light) -> Light:
     return Light(sums.elements, jnp.where(_solid(transport.layout), 0.0, sums.voxels))
 
 
-def _solid(layout: Layout) -> Array:
+def _solid(layout: Layout | Partition) -> Array:
     return layout.from_padded(layout.buried[None].astype(layout.plane.dtype))[0] > 0
 
 
 def make_transport(
-    layout: Layout,
+    layout: Layout | Partition,
     quadrature: Quadrature,
     extinction: Float[Array, "C nx ny nz"] | None,
     bands: int,
@@ -273,12 +275,11 @@ def make_transport(
         return _make_transport(layout, quadrature, extinction, bands, beam, area, albedo)
 
 
-def _make_transport(layout: Layout, quadrature: Quadrature, extinction, bands: int, beam: bool, area, albedo) -> Transport:
+def _make_transport(layout: Layout | Partition, quadrature: Quadrature, extinction, bands: int, beam: bool, area, albedo) -> Transport:
     if not beam and layout.unfolding.axes:
         quadrature = quadrature.mirrored(layout.unfolding.axes)
-    largest_plane = int(np.prod(sorted(layout.padded)[1:]))
     with jax.ensure_compile_time_eval():
-        ordinates = mark_hits(layout, make_ordinates(quadrature, bands, largest_plane))
+        ordinates = mark_over(layout, make_ordinates(quadrature, bands, plane_size(layout)))
     padded = None if extinction is None else layout.to_padded(extinction)
     thickest = None if extinction is None else lax.stop_gradient(jnp.max(extinction)) * layout.spacing
     # Programs differ by these: where the extinction is not known yet, by the one that always serves.

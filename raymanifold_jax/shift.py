@@ -1,6 +1,12 @@
-"""Moving rays to the neighbouring processing element: the only communication of a sweep."""
+"""Moving rays to the neighbouring voxels: the only communication of a sweep.
+
+On one device that is a local move. Where a plane is split in blocks over the mesh axes `u` and `v` (see `partition`), a block
+gets the rim of its neighbours first, around a ring (the torus of the paper's machine).
+"""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,12 +14,27 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 
-def shift(values: Float[Array, "D C P"], offsets: Int[Array, " D"], width: int, wrap_v: bool) -> Float[Array, "D C P"]:
+class Ring(NamedTuple):
+    """A block of a plane on its device: its slots along u and v, how many from the first on are in use, and the mesh's size."""
+
+    height: int
+    width: int
+    rows: Int[Array, ""]
+    columns: Int[Array, ""]
+    parts: tuple[int, int]
+
+
+def shift(
+    values: Float[Array, "D C P"], offsets: Int[Array, " D"], width: int, wrap_v: bool, ring: Ring | None = None
+) -> Float[Array, "D C P"]:
     """Move the rays of each direction by a flat offset: 0, +-1 (along v) or +-`width` (along u).
 
     Planes are flat with `width` voxels along v. Both ends are joined, so u is periodic as it stands; ghost voxels at the rim
-    make that harmless where the domain is not. `wrap_v` joins the ends of each row as well.
+    make that harmless where the domain is not. `wrap_v` joins the ends of each row as well. With a `ring` planes are split
+    over the mesh, and both ends of both axes are joined.
     """
+    if ring is not None:
+        return _shift_around(values, offsets, ring)
     moved = _roll(values, offsets, width)
     if not wrap_v or width == 1:
         return moved
@@ -30,6 +51,42 @@ def _roll(values: Float[Array, "D C P"], offsets: Int[Array, " D"], reach: int) 
     padded = jnp.concatenate([values[..., -reach:], values, values[..., :reach]], axis=-1)
     size = values.shape[-1]
     return jax.vmap(lambda row, offset: lax.dynamic_slice_in_dim(row, reach - offset, size, axis=1))(padded, offsets)
+
+
+def _shift_around(values: Float[Array, "D C P"], offsets: Int[Array, " D"], ring: Ring) -> Float[Array, "D C P"]:
+    height, width = ring.height, ring.width
+    plane = values.reshape(*values.shape[:2], height, width)
+    around = jnp.pad(plane, ((0, 0), (0, 0), (1, 1), (1, 1)))
+    for dim, used, name, parts in ((2, ring.rows, "u", ring.parts[0]), (3, ring.columns, "v", ring.parts[1])):
+        before, after = _rims(plane, dim, used, name, parts)
+        inside = [0, 0, 1, 1]
+        inside[dim] = 0
+        around = lax.dynamic_update_slice(around, before, inside)
+        # Behind the last slot in use, which may be before the block's end.
+        around = lax.dynamic_update_slice(around, after, [used + 1 if d == dim else start for d, start in enumerate(inside)])
+    along_v = jnp.where(jnp.abs(offsets) == 1, offsets, 0)
+    along_u = (offsets - along_v) // width
+    one = lambda block, u, v: lax.dynamic_slice(block, (jnp.zeros_like(u), 1 - u, 1 - v), (block.shape[0], height, width))
+    return jax.vmap(one)(around, along_u, along_v).reshape(values.shape)
+
+
+def _rims(field: Array, dim: int, used: Int[Array, ""], name: str, parts: int) -> tuple[Array, Array]:
+    """The last slice in use of the block before, and the first of the block behind, around the ring."""
+    first = lax.slice_in_dim(field, 0, 1, axis=dim)
+    last = lax.dynamic_slice_in_dim(field, used - 1, 1, axis=dim)
+    if parts == 1:
+        return last, first
+    onwards = [(i, (i + 1) % parts) for i in range(parts)]
+    return lax.ppermute(last, name, onwards), lax.ppermute(first, name, [(to, i) for i, to in onwards])
+
+
+def neighbours(field: Array, dim: int, step: int, used: Int[Array, ""], name: str, parts: int) -> Array:
+    """A field in blocks, moved by one slot (`step` of 1 or -1) along a dimension, around the ring."""
+    before, after = _rims(field, dim, used, name, parts)
+    size = field.shape[dim]
+    around = jnp.concatenate([before, field, jnp.zeros_like(before)], dim)
+    around = lax.dynamic_update_slice_in_dim(around, after, used + 1, dim)
+    return lax.slice_in_dim(around, 1 - step, 1 - step + size, axis=dim)
 
 
 def hop(

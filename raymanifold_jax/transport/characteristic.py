@@ -30,7 +30,8 @@ from jax import lax
 from jaxtyping import Array, Float, Int, UInt32
 
 from ..layout import AXES, AxisReads, Layout, Ordinates, Reads
-from ..shift import shift
+from ..partition import Block
+from ..shift import Ring, shift
 from .slopes import thickness
 
 #: A ray counts as arriving at an element if it is at most this far (voxels) behind its plane where it enters the voxel: the
@@ -75,7 +76,7 @@ class Chords(NamedTuple):
 
 
 def sweep(
-    layout: Layout,
+    layout: Layout | Block,
     ordinates: tuple[Ordinates, ...],
     exitance: Float[Array, "C E"],
     medium: SweptMedium | None = None,
@@ -96,7 +97,7 @@ def sweep(
         at_elements, in_voxels = sums
         fields, occupied, images = _on_axis(axis, lambda a: _fields(layout, a, surface, medium, inflow is not None))
         track = _track(layout, axis if isinstance(axis, int) else 0, fields, occupied)
-        strength = None if factor is None else _on_axis(axis, lambda a, field=factor: _planes(field, a))
+        strength = None if factor is None else _on_axis(axis, lambda a, field=factor: _planes_of(layout, field, a))
         hits, probes, passing = _sweep_axis(track, own, reads, images, inflow, strength, fluence)
         at_elements = at_elements.at[:, reads.hits.element].add(hits).at[:, reads.probes.element].add(probes)
         if passing is not None:
@@ -133,18 +134,24 @@ def _planes(field: Float[Array, "*C X Y Z"], axis: int) -> Float[Array, "K *C P"
     return turned.reshape(*turned.shape[:-2], -1)
 
 
+def _planes_of(layout: Layout | Block, field: Array, axis: int, fill: float = 0) -> Array:
+    """The planes of a layout's field; `fill` where a block of one holds no voxel."""
+    return layout.planes(field, axis, fill) if isinstance(layout, Block) else _planes(field, axis)
+
+
 class _Track(NamedTuple):
     """Everything the sweeps along one axis share."""
 
     fields: _Fields
     occupied: Array  # [K] planes with surfaces other than ghost voxels at their rim
-    rim: np.ndarray  # [P] those ghost voxels
+    rim: np.ndarray | Array  # [P] those ghost voxels
     count: int  # planes
     area: int  # voxels a plane
     width: int
     periodic: bool
     wrap_v: bool
     spacing: float
+    ring: Ring | None = None  # where planes are split over devices
 
     def length(self, own: Ordinates) -> Float[Array, " D"]:
         return self.spacing / jnp.abs(own.direction[:, 0])
@@ -173,51 +180,54 @@ class _Track(NamedTuple):
         return lax.fori_loop(0, self.count, step, rays)
 
 
-def _fields(layout: Layout, axis: int, surface: Float[Array, "C X Y Z"], medium: SweptMedium | None, inflow: bool):
+def _fields(layout: Layout | Block, axis: int, surface: Float[Array, "C X Y Z"], medium: SweptMedium | None, inflow: bool):
     """Everything on planes along a sweep axis.
 
     The fields, which planes hold surfaces, and with `inflow` the image numbers of open ghost voxels.
     """
-    inner = [n - 2 * p for n, p in zip(layout.padded, layout.pad, strict=True)]
-    real_voxel = np.pad(np.ones(inner, bool), [(p, p) for p in layout.pad])
-    surface_voxel = (layout.plane[0] != 1.0) & (real_voxel | _end_planes(layout, axis))
+    planes = lambda field, fill=0: _planes_of(layout, field, axis, fill)
     fields = _Fields(
-        geometry=tuple(_planes(layout.plane[row], axis) for row in (0, *(1 + a for a in AXES[axis]))),
-        exitance=_planes(surface, axis),
-        extinction=None if medium is None else _planes(medium.extinction, axis),
-        source=None if medium is None else _planes(medium.source, axis),
-        slopes=None if medium is None or medium.slopes is None else tuple(_planes(medium.slopes[a], axis) for a in AXES[axis]),
+        geometry=(planes(layout.plane[0], -1), *(planes(layout.plane[1 + a]) for a in AXES[axis])),
+        exitance=planes(surface),
+        extinction=None if medium is None else planes(medium.extinction),
+        source=None if medium is None else planes(medium.source),
+        slopes=None if medium is None or medium.slopes is None else tuple(planes(medium.slopes[a]) for a in AXES[axis]),
         thin=medium is not None and medium.thin,
         onward=medium is not None and medium.onward,
     )
-    occupied = jnp.any(_planes(surface_voxel, axis), axis=-1)
-    return fields, occupied, _planes(layout.inflow_image, axis) if inflow else None
+    occupied = jnp.any((fields.geometry[0] != 1.0) & ~_rim(layout, axis), axis=-1)
+    if isinstance(layout, Block):  # as all devices must go the same way
+        occupied = layout.largest(occupied.astype(np.int32)) > 0
+    return fields, occupied | _end_planes(layout, axis), planes(layout.inflow_image, -1) if inflow else None
 
 
-def _end_planes(layout: Layout, axis: int) -> np.ndarray:
+def _end_planes(layout: Layout | Block, axis: int) -> np.ndarray:
     """The planes of ghost voxels before and behind all others."""
-    number = np.arange(layout.padded[axis])
-    ends = (number < layout.pad[axis]) | (number >= len(number) - layout.pad[axis])
-    return np.expand_dims(ends, [a for a in range(3) if a != axis])
+    number = np.arange(layout.padded_along(axis)[0])
+    return (number < layout.pad[axis]) | (number >= len(number) - layout.pad[axis])
 
 
-def _rim(layout: Layout, axis: int) -> np.ndarray:
+def _rim(layout: Layout | Block, axis: int) -> np.ndarray | Array:
     """The ghost voxels at the rim of a plane, flat."""
+    if isinstance(layout, Block):
+        return layout.rim(axis)
     inside = np.ones([layout.padded[a] - 2 * layout.pad[a] for a in AXES[axis][1:]], bool)
     return ~np.pad(inside, [(layout.pad[a], layout.pad[a]) for a in AXES[axis][1:]]).ravel()
 
 
-def _from_planes(layout: Layout, axis: int, planes: Float[Array, "K C P"]) -> Float[Array, "C X Y Z"]:
+def _from_planes(layout: Layout | Block, axis: int, planes: Float[Array, "K C P"]) -> Float[Array, "C X Y Z"]:
     """The inverse of `_planes`."""
+    if isinstance(layout, Block):
+        return layout.from_planes(planes, axis)
     field = jnp.moveaxis(planes, 1, 0).reshape(-1, *layout.padded_along(axis))
     return field.transpose(0, *(1 + AXES[axis].index(a) for a in range(3)))
 
 
-def _track(layout: Layout, axis: int, fields: _Fields, occupied: Array) -> _Track:
+def _track(layout: Layout | Block, axis: int, fields: _Fields, occupied: Array) -> _Track:
     count, height, width = layout.padded_along(axis)
     periodic, wrap_v = layout.pad[axis] == 0, layout.pad[AXES[axis][2]] == 0
-    rim = _rim(layout, axis)
-    return _Track(fields, occupied, rim, count, height * width, width, periodic, wrap_v, layout.spacing)
+    rim, ring = _rim(layout, axis), layout.ring(axis) if isinstance(layout, Block) else None
+    return _Track(fields, occupied, rim, count, height * width, width, periodic, wrap_v and ring is None, layout.spacing, ring)
 
 
 def _sweep_axis(
@@ -276,7 +286,7 @@ def _chunk(ordinates: Ordinates, number: Int[Array, ""]) -> Ordinates:
 
 
 def count_laps(
-    layout: Layout, ordinates: tuple[Ordinates, ...], extinction: Float[Array, "C X Y Z"] | None, most: int
+    layout: Layout | Block, ordinates: tuple[Ordinates, ...], extinction: Float[Array, "C X Y Z"] | None, most: int
 ) -> tuple[tuple[Ordinates, ...], Int[Array, ""]]:
     """How often rays must go around each periodic axis until less than 1e-6 of their light is left; and the most of these."""
     bands = 1 if extinction is None else extinction.shape[0]
@@ -285,12 +295,15 @@ def count_laps(
 
     def chunk_laps(track: _Track, own: Ordinates):
         def lap(state):
-            number, rays = state
-            return number + 1, track.lap(own, number * track.count, rays, lambda _: None)
+            number, rays, _ = state
+            rays = track.lap(own, number * track.count, rays, lambda _: None)
+            return number + 1, rays, largest(jnp.max(rays))
 
         rays = jnp.where(own.weight[:, None, None] > 0, jnp.ones((1, bands, track.area), dark.dtype), 0.0)
-        more = lambda state: (state[0] < most) & (jnp.max(state[1]) > 1e-6)
-        return lax.while_loop(more, lap, (jnp.int32(0), rays))[0] + 1
+        more = lambda state: (state[0] < most) & (state[2] > 1e-6)
+        return lax.while_loop(more, lap, (jnp.int32(0), rays, jnp.max(rays)))[0] + 1
+
+    largest = layout.largest if isinstance(layout, Block) else lambda value: value
 
     counted, longest = [], jnp.int32(1)
     for axis, own in enumerate(ordinates):
@@ -468,7 +481,7 @@ def _cross(rays, chords: Chords, fields: _Fields, length, entering, track: _Trac
     for number in range(3):
         if number:
             # The barrier keeps XLA from computing the segment again for each reader of the moved rays.
-            rays = shift(lax.optimization_barrier(rays), chords.offsets[number - 1], track.width, track.wrap_v)
+            rays = shift(lax.optimization_barrier(rays), chords.offsets[number - 1], track.width, track.wrap_v, track.ring)
         starts.append(rays)
         share = chords.share[number][:, None, None]
         if plane is not None:

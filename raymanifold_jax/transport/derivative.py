@@ -1,7 +1,7 @@
 """Sweeps that can be differentiated: by the sources they carry, and by the extinction they cross.
 
 `swept` is `sweep` and `unswept` is its transpose, with fields of the lattice in and out, under JAX's transformations:
-forwards JAX differentiates them itself, backwards `adjoint_sweep` does. With K(s) for a sweep through the extinction s, the
+forwards JAX differentiates them itself, backwards `adjoint_sweep` does, on one device or over a mesh. With K(s) for a sweep through the extinction s, the
 adjoints of (s, x) -> K x and (s, y) -> K'y share the form <y, K x>:
 
     of K x:   x' = K'y,      s' = d<y, K x>/ds        (y the cotangent)
@@ -25,8 +25,9 @@ from jaxtyping import Array, Float
 from .. import checks
 from ..adjoint import with_adjoint
 from ..layout import Layout, Ordinates
-from .characteristic import Inflow, SweptMedium, sweep
-from .transpose import adjoint_sweep
+from ..partition import Partition
+from .characteristic import Inflow, SweptMedium
+from .sharded import adjoint_over, sweep_over
 
 Field = Float[Array, "C nx ny nz"]
 Slopes = tuple[Float[Array, "C X Y Z"], ...]
@@ -45,7 +46,7 @@ class Manner:
 
 def swept(
     manner: Manner,
-    layout: Layout,
+    layout: Layout | Partition,
     ordinates: tuple[Ordinates, ...],
     extinction: Float[Array, "C X Y Z"] | None,
     exitance: Float[Array, "C E"],
@@ -60,7 +61,7 @@ def swept(
 
 def unswept(
     manner: Manner,
-    layout: Layout,
+    layout: Layout | Partition,
     ordinates: tuple[Ordinates, ...],
     extinction: Float[Array, "C X Y Z"] | None,
     at_elements: Float[Array, "C E"],
@@ -144,7 +145,7 @@ class _UnsweepAdjoint:
         return layout, ordinates, curve, elements, voxels
 
 
-def _whole_adjoint(manner: Manner, layout: Layout, ordinates, extinction, weights: Results, sent: Sent, inflow):
+def _whole_adjoint(manner: Manner, layout: Layout | Partition, ordinates, extinction, weights: Results, sent: Sent, inflow):
     """Everything's derivative. What is missing is given as nothing, so that all calls share one program: it is a large one."""
     exitance, source, slopes = sent
     real, bands = exitance.dtype, exitance.shape[0]
@@ -168,7 +169,7 @@ def _any(wanted: Any) -> bool:
     return any(jax.tree.leaves(wanted))
 
 
-def _medium(manner: Manner, layout: Layout, extinction, source, slopes, like: Array) -> SweptMedium | None:
+def _medium(manner: Manner, layout: Layout | Partition, extinction, source, slopes, like: Array) -> SweptMedium | None:
     if extinction is None:
         return None
     dark = jnp.zeros((extinction.shape[0], *layout.shape), like.dtype)
@@ -182,14 +183,14 @@ def _medium(manner: Manner, layout: Layout, extinction, source, slopes, like: Ar
 @eqx.filter_jit
 def _sweep(manner: Manner, layout, ordinates, extinction, exitance, source, slopes, inflow) -> Results:
     medium = _medium(manner, layout, extinction, source, slopes, exitance)
-    return sweep(layout, ordinates, exitance, medium, inflow, manner.fluence)
+    return sweep_over(layout, ordinates, exitance, medium, inflow, manner.fluence)
 
 
 @eqx.filter_jit
 def _unsweep(manner: Manner, sloped: bool, layout, ordinates, extinction, at_elements, in_voxels) -> Sent:
     dark = jnp.zeros((at_elements.shape[0], *layout.padded), at_elements.dtype)
     medium = _medium(manner, layout, extinction, None, (dark,) * 3 if sloped else None, at_elements)
-    found = adjoint_sweep(layout, ordinates, at_elements, in_voxels, None, medium)
+    found = adjoint_over(layout, ordinates, at_elements, in_voxels, None, medium)
     return found.exitance, found.source, found.slopes
 
 
@@ -197,4 +198,4 @@ def _unsweep(manner: Manner, sloped: bool, layout, ordinates, extinction, at_ele
 def _adjoint(manner: Manner, whole: bool, layout, ordinates, extinction, weights: Results, sent: Sent, inflow):
     exitance, source, slopes = sent
     medium = _medium(manner, layout, extinction, source, slopes, weights[0])
-    return adjoint_sweep(layout, ordinates, *weights, exitance if whole else None, medium, inflow)
+    return adjoint_over(layout, ordinates, *weights, exitance if whole else None, medium, inflow)

@@ -20,6 +20,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..layout import Layout
+from ..partition import Block
 
 #: Optical depth of a voxel's side up to which light is taken to be the same all over it.
 THIN = 0.1
@@ -36,7 +37,7 @@ def flattening(depth: Array, albedo: Array) -> Array:
 
 
 def source_slopes(
-    layout: Layout, source: Float[Array, "C X Y Z"], albedo: Float[Array, "C X Y Z"], extinction: Float[Array, "C X Y Z"]
+    layout: Layout | Block, source: Float[Array, "C X Y Z"], albedo: Float[Array, "C X Y Z"], extinction: Float[Array, "C X Y Z"]
 ) -> tuple[Float[Array, "C X Y Z"], ...]:
     """Slopes along x, y and z per voxel's side, on the padded lattice; linear in `source`.
 
@@ -48,17 +49,19 @@ def source_slopes(
     there = scatters.astype(source.dtype)
     slopes = []
     for axis in range(3):
-        periodic = layout.pad[axis] == 0
-        before, after = (_neighbour(mean, axis, step, periodic) for step in (-1, 1))
-        has_before, has_after = (_neighbour(there, axis, step, periodic) for step in (-1, 1))
+        before, after = (_neighbour(layout, mean, axis, step) for step in (-1, 1))
+        has_before, has_after = (_neighbour(layout, there, axis, step) for step in (-1, 1))
         both = has_before + has_after
         rise = has_after * (after - mean) + has_before * (mean - before)
         slopes.append(strength * rise / jnp.maximum(both, 1.0))
     return tuple(slopes)
 
 
-def _neighbour(field: Array, axis: int, step: int, periodic: bool) -> Array:
+def _neighbour(layout: Layout | Block, field: Array, axis: int, step: int) -> Array:
     """Each voxel's neighbour; 0 beyond the ends."""
+    if isinstance(layout, Block):
+        return layout.neighbour(field, axis, step)
+    periodic = layout.pad[axis] == 0
     axis += 1
     moved = jnp.roll(field, -step, axis)
     if periodic:

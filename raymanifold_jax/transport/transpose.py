@@ -28,6 +28,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..layout import AXES, AxisReads, Layout, Ordinates
+from ..partition import Block
 from .characteristic import (
     Inflow,
     SweptMedium,
@@ -38,7 +39,7 @@ from .characteristic import (
     _mean_of_hits,
     _mean_of_paths,
     _on_axis,
-    _planes,
+    _planes_of,
     _read_tile,
     _row,
     _Track,
@@ -80,7 +81,7 @@ def transposed_sweep(
 
 
 def adjoint_sweep(
-    layout: Layout,
+    layout: Layout | Block,
     ordinates: tuple[Ordinates, ...],
     at_elements: Float[Array, "C E"],
     in_voxels: Float[Array, "C nx ny nz"] | None,
@@ -103,7 +104,7 @@ def adjoint_sweep(
     def one_axis(axis, own: Ordinates, reads: AxisReads, sums):
         fields, occupied, images = _on_axis(axis, lambda a: _fields(layout, a, sent, medium, inflow is not None))
         track = _track(layout, axis if isinstance(axis, int) else 0, fields, occupied)
-        planes = lambda field: None if field is None else _on_axis(axis, lambda a: _planes(field, a))
+        planes = lambda field: None if field is None else _on_axis(axis, lambda a: _planes_of(layout, field, a))
         rows = tuple(at_elements[:, r.element] for r in reads)
         entry = None if inflow is None else _Entry(images, inflow.radiance, planes(factor))
         back, light = _axis_adjoint(track, own, reads, rows, planes(asked), entry, whole)
@@ -140,7 +141,7 @@ def _in_scene_order(fields: list[Array], axis: int, sloped: bool) -> list[Array]
     return [*fields[:2], *(fields[2 + AXES[axis].index(a)] for a in range(3)), *fields[5:]]
 
 
-def _at_elements(layout: Layout, field: Float[Array, "C X Y Z"]) -> Float[Array, "C E"]:
+def _at_elements(layout: Layout | Block, field: Float[Array, "C X Y Z"]) -> Float[Array, "C E"]:
     """The transpose of `Layout.exitance_field`."""
     values = field.reshape(field.shape[0], -1)[:, layout.cell] * layout.share
     return jnp.zeros((field.shape[0], layout.elements), field.dtype).at[:, layout.source_element].add(values)
