@@ -52,6 +52,7 @@ _MODULE_OF = {
     "Jacobi": "solvers",
     "Krylov": "solvers",
     "OptimistixFixedPoint": "optimistix_solver",
+    "pe_array": "sharding",
     "Solution": "solution",
     "solve": "solve",
     "ErrorEstimate": "error_estimate",
@@ -110,6 +111,7 @@ if TYPE_CHECKING:
     from raymanifold_jax.shapes import Shape as Shape
     from raymanifold_jax.shapes import Sphere as Sphere
     from raymanifold_jax.shapes import Torus as Torus
+    from raymanifold_jax.sharding import pe_array as pe_array
     from raymanifold_jax.solution import Solution as Solution
     from raymanifold_jax.solve import solve as solve
     from raymanifold_jax.solvers import Anderson as Anderson

@@ -78,7 +78,7 @@ class Moves(NamedTuple):
 
 
 def make_moves(name: str, source: Int[np.ndarray, "p s"], wanted: Int[np.ndarray, "p t"]) -> Moves:
-    """From the blocks `source` of an axis over the mesh axis `name` to blocks of the columns `wanted` (each any number of times)."""
+    """From the blocks `source` of an axis over the mesh axis `name` to blocks of the columns `wanted`, repeated or not."""
     parts, size = source.shape
     where = positions(source)
     needs: dict[tuple[int, int], list[int]] = {}

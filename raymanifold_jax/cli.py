@@ -115,6 +115,7 @@ def render(
             check_writable(target, ctx)
     size = settings["size"] or scene.default_size
     with one_line_errors():
+        _start(settings["pe"])
         built = _build(scene, size, settings["directions"])
         views = {view: make(built.lattice, resolution) for view, make in scene.views.items()}
         solution, seconds = _solve(built, **settings)
@@ -148,6 +149,7 @@ def render(
 def solve(ctx: click.Context, scene: "SceneEntry", **settings: Any) -> None:
     """Solve SCENE (ring, three-balls, room or a file.toml) and print where its light goes."""
     with one_line_errors():
+        _start(settings["pe"])
         built = _build(scene, settings["size"] or scene.default_size, settings["directions"])
         solution, seconds = _solve(built, **settings)
     if not settings["quiet"]:
@@ -248,6 +250,14 @@ def cost(scene: "SceneEntry", size: int | None, pe: tuple[int, int], half_width:
         click.echo(str(rm.cost_report(scene.build(size or scene.default_size), scheme, pe)))
 
 
+def _start(pe: tuple[int, int] | None) -> None:
+    """Have JAX start with as many devices as are asked for, before anything else makes it start."""
+    if pe is not None:
+        import raymanifold_jax as rm
+
+        rm.pe_array(*pe)
+
+
 def _build(entry: "SceneEntry", size: int, directions: int) -> "Scene":
     """The scene, if its solve fits into memory."""
     _use_cache()
@@ -268,6 +278,7 @@ def _solve(
     checkpoint: Path | None,
     resume: bool,
     save: Path | None,
+    pe: tuple[int, int] | None,
     **_: Any,
 ) -> tuple["Solution", float]:
     """The solution, and the seconds it took."""
@@ -285,6 +296,7 @@ def _solve(
         rtol=rtol,
         max_sweeps=max_sweeps,
         progress=not (quiet or no_progress),
+        mesh=None if pe is None else rm.pe_array(*pe),
         **options,
     )
     jax.block_until_ready(solution.diffuse_fluence)

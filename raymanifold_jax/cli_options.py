@@ -194,6 +194,12 @@ solve_options = (
         callback=_save,
         help="Keep the solution, for rm.load.",
     ),
+    click.option(
+        "--pe",
+        type=Elements(),
+        metavar="AxB",
+        help="Split the lattice over an array of A x B devices; CPUs are made virtual. [default: one device]",
+    ),
     click.option("--quiet", is_flag=True, help="Print nothing but warnings and errors."),
     click.option("--no-progress", is_flag=True, help="No progress bar."),
 )

@@ -25,6 +25,8 @@ from . import checks
 from .layout import Layout
 from .march import fill, transmittance
 from .operator import Light, Materials, Transport, make_transport
+from .partition import Partition
+from .placement import stored
 from .prepare import Prepared
 from .quadrature import Quadrature
 from .scene import OPEN, PointLight, Scene, Sky, Sun, Wall
@@ -62,17 +64,17 @@ def first_flight(
     compact = compact_sources(scene, surfaces)
     glow = materials.medium_source
     if compact is not None and glow is not None:
-        glow = jnp.where(compact.emits, 0.0, glow)
+        glow = jnp.where(stored(layout, jnp.asarray(compact.emits)), 0.0, glow)
     swept = _swept(transport, Light(materials.emission, glow), sky)
     if (points := small_emitters(scene, surfaces)) is not None:
         # The elements' share of the emitters' light is taken exactly; the sweep's share of it is taken out.
         others = _swept(transport, Light(dark.elements, glow), sky).elements
-        swept = Light(others + _conserved(scene, surfaces, points) / jnp.pi, swept.voxels)
+        swept = Light(others + stored(layout, _conserved(scene, surfaces, points) / jnp.pi), swept.voxels)
     if compact is not None:
-        swept = swept + _from_volumes(scene, surfaces, compact)
+        swept = swept + stored(layout, _from_volumes(scene, surfaces, compact))
     for light in scene.lights:
         if isinstance(light, PointLight):
-            swept = swept + _from_point(scene, surfaces, light)
+            swept = swept + stored(layout, _from_point(scene, surfaces, light))
     zero = jax.tree.map(jnp.zeros_like, swept)
     suns = [_from_sun(scene, surfaces, layout, light, materials, prepared) for light in scene.lights if isinstance(light, Sun)]
     return Direct(sun=sum(suns, start=zero), rest=swept)
@@ -86,7 +88,7 @@ def _swept(transport: Transport, leaving: Light, sky: Inflow | None) -> Light:
     return transport(leaving, sky)
 
 
-def sky_inflow(scene: Scene, layout: Layout, quadrature: Quadrature) -> Inflow | None:
+def sky_inflow(scene: Scene, layout: Layout | Partition, quadrature: Quadrature) -> Inflow | None:
     """Radiance of all skies along the swept directions, as each mirror image of an open side sees it."""
     skies = [light for light in scene.lights if isinstance(light, Sky)]
     if not skies:
@@ -116,7 +118,12 @@ def _dark(materials: Materials) -> Light:
 
 
 def _from_sun(
-    scene: Scene, surfaces: Surfaces, layout: Layout, sun: Sun, materials: Materials, prepared: Prepared | None = None
+    scene: Scene,
+    surfaces: Surfaces,
+    layout: Layout | Partition,
+    sun: Sun,
+    materials: Materials,
+    prepared: Prepared | None = None,
 ) -> Light:
     side = (np.arange(_SUN_OFFSETS) + 0.5) / _SUN_OFFSETS
     offsets = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
@@ -124,7 +131,7 @@ def _from_sun(
     direction = np.asarray(sun.direction)
     beam = Quadrature(np.tile(direction, (count, 1)), np.full(count, 1 / count), offsets, "sun")
     make = lambda: _beam_transport(layout, beam, materials.extinction, scene.bands)
-    key = ("sun", *direction.tolist(), scene.bands)
+    key = ("sun", *direction.tolist(), scene.bands, layout.shapes.mesh if isinstance(layout, Partition) else None)
     transport = make() if prepared is None else prepared.transport(key, materials.extinction, make)
     images = layout.unfolding.images()
     irradiance = jnp.broadcast_to(sun.irradiance, (scene.bands,))
@@ -137,7 +144,7 @@ def _from_sun(
     return Light(mean.elements * jnp.asarray(cosines, radiance.dtype) / jnp.pi, mean.voxels * (len(images) / (4 * np.pi)))
 
 
-def _beam_transport(layout: Layout, beam: Quadrature, extinction, bands: int) -> Transport:
+def _beam_transport(layout: Layout | Partition, beam: Quadrature, extinction, bands: int) -> Transport:
     # A beam is no quadrature of the sphere: it is swept as it is, not reduced to one side of the mirrors.
     return make_transport(layout, beam, extinction, bands, beam=True)
 

@@ -275,7 +275,9 @@ def make_transport(
         return _make_transport(layout, quadrature, extinction, bands, beam, area, albedo)
 
 
-def _make_transport(layout: Layout | Partition, quadrature: Quadrature, extinction, bands: int, beam: bool, area, albedo) -> Transport:
+def _make_transport(
+    layout: Layout | Partition, quadrature: Quadrature, extinction, bands: int, beam: bool, area, albedo
+) -> Transport:
     if not beam and layout.unfolding.axes:
         quadrature = quadrature.mirrored(layout.unfolding.axes)
     with jax.ensure_compile_time_eval():

@@ -1,7 +1,7 @@
 """A layout in blocks over a 2D mesh of devices: what each holds, and how the scene is turned between sweep axes.
 
-Fields lie on the devices as blocks of x (over the mesh axis `u`) and y (over `v`), whole along z. The sweep along z uses them as
-they are; the planes of the other two come by two all-to-alls each (Langer, Breton & Zucker 1995, section 7.1: the scene is
+Fields lie on the devices as blocks of x (over the mesh axis `u`) and y (over `v`), whole along z. The sweep along z uses them
+as they are; the planes of the other two come by two all-to-alls each (Langer, Breton & Zucker 1995, section 7.1: the scene is
 rotated), with [i/u] for "axis i split over u":
 
     along x:   [x/u, y/v, z]  ->  [x/u, y, z/v]  ->  [x, y/u, z/v]
@@ -167,14 +167,18 @@ class Partition(eqx.Module):
     def from_padded(self, field: Float[Array, "C X Y Z"]) -> Float[Array, "C nx ny nz"]:
         return self.on_blocks(lambda block, _, field, __: block.from_padded(field), (), field, (), FIELD)
 
+    def place(self, field: np.ndarray) -> Float[Array, "nx ny nz"]:
+        """A known field in the shape of stored ones."""
+        return put(self.shapes.mesh, np.asarray(field, self.plane.dtype), Spec(*NAMES))
+
     def cut(self, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinates, ...]:
         """Directions whose hits are marked on the whole layout, as blocks read them; the same on all devices but for marks."""
         whole: Layout = self.whole.value
         mesh = self.shapes.mesh
         found = []
-        for own, reads, cut in zip(ordinates, whole.reads, _cut_rows(self.shapes, whole), strict=True):
+        for own, cut in zip(ordinates, _cut_rows(self.shapes, whole), strict=True):
             bits = []
-            for mark, read, rows in zip((own.hit_bits, own.probe_bits), reads, cut, strict=True):
+            for mark, rows in zip((own.hit_bits, own.probe_bits), cut, strict=True):
                 assert mark is not None
                 # Rows that pad read with no weight, whatever their bits.
                 bits.append(put(mesh, np.moveaxis(np.asarray(mark)[:, :, np.maximum(rows.row, 0)], 2, 0), TABLE))
@@ -386,7 +390,6 @@ def _by_device(shapes: Shapes, layout: Layout, axis: int, reads: Reads):
     row = np.flatnonzero(np.any(normal != 0, axis=0))
     first = np.asarray(reads.first_tile) * reads.tile
     plane = np.searchsorted(first, row, side="right") - 1
-    # Planes without reads begin where the next does.
     width = layout.padded_along(axis)[2]
     cell = np.asarray(reads.cell)[row]
     _, u, v = AXES[axis]

@@ -12,10 +12,14 @@ from collections.abc import Callable, Hashable
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from . import checks
 from .layout import Layout, make_layout
+from .partition import Partition, make_partition
+from .placement import known
 from .scene import Scene
 from .surfaces import Surfaces, find_surfaces
 
@@ -26,6 +30,15 @@ class Prepared:
     def __init__(self, surfaces: Surfaces, layout: Layout):
         self.surfaces, self.layout = surfaces, layout
         self._kept: dict[Hashable, tuple[list[np.ndarray], Any, Any]] = {}
+        self._partitions: dict[Mesh, Partition] = {}
+
+    def layout_on(self, mesh: Mesh | None) -> Layout | Partition:
+        """The layout, or its blocks on a mesh."""
+        if mesh is None:
+            return self.layout
+        if mesh not in self._partitions:
+            self._partitions[mesh] = make_partition(self.layout, mesh)
+        return self._partitions[mesh]
 
     def transport(self, key: Hashable, medium: Any, make: Callable[[], Any], alive: Any = None) -> Any:
         """`make()`, or what it gave before for the same `key` and equal arrays of the `medium`.
@@ -34,7 +47,7 @@ class Prepared:
         """
         if checks.is_traced(medium):
             return make()
-        now = [np.asarray(leaf) for leaf in jax.tree.leaves(medium)]
+        now = [known(jnp.asarray(leaf)) for leaf in jax.tree.leaves(medium)]
         before, kept, _ = self._kept.get(key, ([], None, None))
         same = len(now) == len(before) and all(map(np.array_equal, now, before))
         if kept is None or not same:

@@ -34,8 +34,8 @@ def pe_array(nu: int, nv: int) -> Mesh:
     if len(devices) < nu * nv:
         kind = devices[0].platform.upper()
         way = (
-            f"JAX has started already: call pe_array before anything that computes, or set JAX_NUM_CPU_DEVICES={nu * nv} in the "
-            "environment"
+            "JAX has started already: call pe_array before anything that computes, or set "
+            f"JAX_NUM_CPU_DEVICES={nu * nv} in the environment"
             if kind == "CPU"
             else "use a smaller array, more processes (jax.distributed), or virtual devices (JAX_PLATFORMS=cpu)"
         )
@@ -46,7 +46,7 @@ def pe_array(nu: int, nv: int) -> Mesh:
 def _make_virtual(count: int) -> None:
     """As many CPU devices, unless JAX runs already or they were asked for in other ways."""
     flags = os.environ.get("XLA_FLAGS", "")
-    if "xla_force_host_platform_device_count" in flags or getattr(jax.config, "jax_num_cpu_devices") >= count:
+    if "xla_force_host_platform_device_count" in flags or jax.config.jax_num_cpu_devices >= count:
         return
     try:
         jax.config.update("jax_num_cpu_devices", count)

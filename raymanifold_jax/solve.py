@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.sharding import Mesh
 from jaxtyping import Array, Float
 
 from . import checks
@@ -27,10 +28,12 @@ from .iteration import Iteration, System, certify
 from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
 from .optimistix_solver import OptimistixFixedPoint
+from .placement import restored, stored
 from .prepare import Prepared, prepare
 from .progress import Progress, make_progress
 from .quadrature import Quadrature, for_scene
 from .scene import OPEN, PointLight, Scene, Sky, Sun
+from .sharding import check_mesh
 from .solution import Energy, Solution, _Hidden
 from .solvers import Anderson, Jacobi, Krylov, automatic
 from .source_checks import check_sources
@@ -49,7 +52,7 @@ def solve(
     max_sweeps: int = 1000,
     throw: bool = False,
     progress: bool | Progress | None = None,
-    mesh: None = None,
+    mesh: Mesh | None = None,
     checkpoint: Checkpoint | None = None,
     prepared: Prepared | None = None,
 ) -> Solution:
@@ -75,6 +78,9 @@ def solve(
     - `checkpoint`: an `rm.Checkpoint`, in which the iteration keeps its state, and from which it may go on.
     - `prepared`: what `prepare(scene)` gave for a scene of the same shapes, lattice and kinds of sides, to save time; pass
       the same `quadrature` each time as well.
+    - `mesh`: `rm.pe_array(nu, nv)` splits the lattice over devices (see `partition`). Results are the same to rounding. What
+      needs no sweep is done on one device: the geometry, light straight from point lights and small emitters, readings of
+      the solution. Not with the paper's scheme, nor under `jit` and `vmap`.
     - `progress`: True or None shows a bar on a terminal when the solve takes long; False never; or a `Progress`.
 
     **Raises** `ValueError` or `TypeError` for unusable arguments, traced shapes among them, before any work; `RuntimeError`
@@ -89,6 +95,7 @@ def solve(
         meter.start(f"solve {scene.summary()}")
         prepared = prepare(scene) if prepared is None else prepared
         surfaces = prepared.surfaces
+        layout = prepared.layout_on(mesh)
         with jax.ensure_compile_time_eval():  # of what is known while JAX stages the rest
             check_sources(scene, surfaces)
         stuff = materials(scene, surfaces)
@@ -98,11 +105,13 @@ def solve(
             system, quadrature = nodes.system, nodes.quadrature
         else:
             area = surfaces.area if _exchanges(scene, stuff) else None
-            albedo = stuff.scattering_albedo
-            make = lambda: make_transport(prepared.layout, quadrature, stuff.extinction, scene.bands, area=area, albedo=albedo)
-            key = (id(quadrature), scene.bands, area is None)
-            transport = prepared.transport(key, (stuff.extinction, albedo), make, quadrature)
-            system = System(transport, stuff, first_flight(scene, surfaces, transport, quadrature, stuff, prepared))
+            own = stored(layout, stuff)
+            make = lambda: make_transport(
+                layout, quadrature, own.extinction, scene.bands, area=area, albedo=own.scattering_albedo
+            )
+            key = (id(quadrature), scene.bands, area is None, mesh)
+            transport = prepared.transport(key, (stuff.extinction, stuff.scattering_albedo), make, quadrature)
+            system = System(transport, own, first_flight(scene, surfaces, transport, quadrature, own, prepared))
         iteration, solver = _iterate(
             system, surfaces if nodes is None else None, float(rtol), solver, max_sweeps, meter, checkpoint
         )
@@ -174,7 +183,14 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
         kinds = 'rm.Krylov(), rm.Anderson(), rm.OptimistixFixedPoint(...), rm.Jacobi() or "auto"'
         checks.fail("solver", repr(solver), kinds, 'leave it at "auto"')
     if mesh is not None:
-        checks.fail("mesh", repr(mesh), "None", "sweeps run on one device so far; leave mesh out")
+        check_mesh(mesh, scene.lattice.shape)
+        if isinstance(scheme, LightRayCube):
+            checks.fail(
+                "mesh", f"a mesh with {scheme}", "rm.Characteristic()", "the paper's scheme runs on one device; leave mesh out"
+            )
+        if checks.is_traced(stop_gradient(scene)):
+            advice = "jax.grad and jvp go through outside of jit; or leave mesh out"
+            checks.fail("mesh", "a mesh under jit or vmap", "a scene of known values", advice, TypeError)
     if checkpoint is not None:
         checks.instance("checkpoint", checkpoint, Checkpoint, 'pass rm.Checkpoint("run.npz")')
     if prepared is not None:
@@ -223,12 +239,15 @@ def _finish(
         everywhere = system.transport(system.materials.reflected(system.source + bounced), fluence=True)
         bounced = Light(bounced.elements, everywhere.voxels)
     rest, sun = system.direct.rest + bounced, system.direct.sun
+    if nodes is None:
+        rest, sun = restored(system.transport.layout, (rest, sun))
     if nodes is not None:
         rest, sun, outside = *nodes.at_elements(rest, sun), jnp.asarray(~nodes.solid)
         free = jnp.where(outside, jnp.ones((), rest.elements.dtype), 0.0)
     else:
         outside = jnp.asarray(~surfaces.solid)
-        free = jnp.where(outside, system.transport.coverage / _whole(system.transport), 0.0)
+        covered = restored(system.transport.layout, system.transport.coverage / _whole(system.transport))
+        free = jnp.where(outside, covered, 0.0)
     fluence = lambda light: jnp.where(outside, 4 * jnp.pi * light.voxels, 0.0)
     fields = {
         "diffuse_irradiance": jnp.pi * rest.elements,

@@ -1,8 +1,8 @@
 """Sweeps that can be differentiated: by the sources they carry, and by the extinction they cross.
 
-`swept` is `sweep` and `unswept` is its transpose, with fields of the lattice in and out, under JAX's transformations:
-forwards JAX differentiates them itself, backwards `adjoint_sweep` does, on one device or over a mesh. With K(s) for a sweep through the extinction s, the
-adjoints of (s, x) -> K x and (s, y) -> K'y share the form <y, K x>:
+`swept` is `sweep` and `unswept` is its transpose, with fields of the lattice in and out, on one device or over a mesh, under
+JAX's transformations: forwards JAX differentiates them itself, backwards `adjoint_sweep` does. With K(s) for a sweep through
+the extinction s, the adjoints of (s, x) -> K x and (s, y) -> K'y share the form <y, K x>:
 
     of K x:   x' = K'y,      s' = d<y, K x>/ds        (y the cotangent)
     of K'y:   y' = K z,      s' = d<y, K z>/ds        (z the cotangent)

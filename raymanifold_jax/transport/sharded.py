@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int

@@ -37,7 +37,10 @@ def flattening(depth: Array, albedo: Array) -> Array:
 
 
 def source_slopes(
-    layout: Layout | Block, source: Float[Array, "C X Y Z"], albedo: Float[Array, "C X Y Z"], extinction: Float[Array, "C X Y Z"]
+    layout: Layout | Block,
+    source: Float[Array, "C X Y Z"],
+    albedo: Float[Array, "C X Y Z"],
+    extinction: Float[Array, "C X Y Z"],
 ) -> tuple[Float[Array, "C X Y Z"], ...]:
     """Slopes along x, y and z per voxel's side, on the padded lattice; linear in `source`.
 

@@ -1,0 +1,85 @@
+"""Between one device and a mesh: where the arrays of a solve lie.
+
+A solve on a mesh prepares geometry and materials on one device (the default one of each process), keeps what it iterates on in
+the mesh's blocks (`partition`), and hands its solution back on one device. Both ways are linear, each the other's transpose, so
+gradients go through.
+
+Public: `stored`, `restored`, `known`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh
+from jax.sharding import PartitionSpec as Spec
+from jaxtyping import Array
+
+from .adjoint import linear
+from .layout import Layout
+from .partition import Partition, put
+from .sharding import NAMES
+
+Tree = TypeVar("Tree")
+
+
+def stored(layout: Layout | Partition, tree: Tree) -> Tree:
+    """Arrays of one device as the layout wants them: values of elements (C, E) everywhere, fields of the scene in blocks.
+
+    Without a mesh, everything as it is.
+    """
+    if isinstance(layout, Layout):
+        return tree
+    return jax.tree.map(lambda a: _moved(layout, a, True), tree)
+
+
+def restored(layout: Layout | Partition, tree: Tree) -> Tree:
+    """The inverse of `stored`."""
+    if isinstance(layout, Layout):
+        return tree
+    return jax.tree.map(lambda a: _moved(layout, a, False), tree)
+
+
+def known(array: Array) -> np.ndarray:
+    """All numbers of an array, wherever they lie."""
+    if array.is_fully_addressable or array.is_fully_replicated:
+        return np.asarray(array)
+    return np.asarray(multihost_utils.process_allgather(array, tiled=True))
+
+
+def _moved(partition: Partition, array: Array, to_mesh: bool) -> Array:
+    size = partition.shape if to_mesh else partition.shapes.scene_shape
+    shape = (*array.shape[:-3], *size) if array.ndim > 2 else array.shape
+    there, back = _Store(partition.shapes.mesh, partition.shape), _Restore(partition.shapes.scene_shape)
+    forward, backward = (there, back) if to_mesh else (back, there)
+    if not jnp.issubdtype(array.dtype, jnp.inexact):
+        return forward((), [array])[0]
+    return linear(forward, backward, (), [array], [jnp.zeros(shape, array.dtype)])[0]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Store:
+    mesh: Mesh
+    shape: tuple[int, int, int]
+
+    def __call__(self, _: Any, arrays: list[Array]) -> list[Array]:
+        (array,) = arrays
+        if array.ndim <= 2:
+            return [put(self.mesh, array, Spec())]
+        behind = [(0, wanted - size) for wanted, size in zip(self.shape, array.shape[-3:], strict=True)]
+        values = np.pad(np.asarray(array), [(0, 0)] * (array.ndim - 3) + behind)
+        return [put(self.mesh, values, Spec(*[None] * (array.ndim - 3), *NAMES))]
+
+
+@dataclasses.dataclass(frozen=True)
+class _Restore:
+    shape: tuple[int, int, int]
+
+    def __call__(self, _: Any, arrays: list[Array]) -> list[Array]:
+        values = known(arrays[0])
+        return [jnp.asarray(values[(..., *(slice(n) for n in self.shape))] if values.ndim > 2 else values)]
