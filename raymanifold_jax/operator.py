@@ -27,6 +27,7 @@ from . import checks
 from .lattice import Lattice
 from .layout import Layout, Ordinates, make_ordinates
 from .partition import Partition
+from .placement import stored
 from .quadrature import Quadrature
 from .scene import Scene, Wall
 from .surfaces import Surfaces, patch_points
@@ -296,7 +297,7 @@ def _make_transport(
             )
     ones = lambda *shape: jnp.ones((bands, *shape), layout.plane.dtype)
     transport = Transport(layout, ordinates, padded, ones(), ones(), ones(), thin, thick and not beam)
-    sums = _furnace(transport, Light(ones(layout.elements), None if extinction is None else ones(*layout.shape)))
+    sums = _furnace(transport, stored(layout, Light(ones(layout.elements), None if extinction is None else ones(*layout.shape))))
     assert sums.voxels is not None
     fields = {"element_sums": sums.elements, "voxel_sums": sums.voxels, "coverage": sums.voxels[0]}
     transport = dataclasses.replace(transport, **fields)

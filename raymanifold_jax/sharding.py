@@ -46,7 +46,7 @@ def pe_array(nu: int, nv: int) -> Mesh:
 def _make_virtual(count: int) -> None:
     """As many CPU devices, unless JAX runs already or they were asked for in other ways."""
     flags = os.environ.get("XLA_FLAGS", "")
-    if "xla_force_host_platform_device_count" in flags or jax.config.jax_num_cpu_devices >= count:
+    if "xla_force_host_platform_device_count" in flags or _asked_for() >= count:
         return
     try:
         jax.config.update("jax_num_cpu_devices", count)
@@ -55,6 +55,11 @@ def _make_virtual(count: int) -> None:
     patience = "xla_cpu_collective_call_terminate_timeout_seconds"
     if patience not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --{patience}={_PATIENCE}".strip()
+
+
+def _asked_for() -> int:
+    count: int = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
+    return count
 
 
 def check_mesh(mesh: object, shape: tuple[int, int, int]) -> None:

@@ -12,6 +12,8 @@ _MANY = 15_000  # of the 65 530 regions of memory that Linux grants a process
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    # Virtual devices for tests of meshes; all else runs on the first.
+    jax.config.update("jax_num_cpu_devices", 8)
     # Environment variables, because pytest-xdist's workers and the command line's subprocesses inherit them. The cache
     # lies in pytest's own (`pytest --cache-clear` empties it) and outlives the run.
     cache = getattr(config, "cache", None)  # none with `-p no:cacheprovider`

@@ -1,0 +1,257 @@
+"""A mesh of devices computes what one device does.
+
+Sums over directions and elements are added up in another order there, and nothing else: results agree to a few units in the last
+place of float64 (1e-12 of the largest value; what a wrong neighbour or a lost ray costs is 1e-3 or more). `tests/conftest.py`
+makes 8 virtual devices.
+"""
+
+import os
+import re
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.sharding import AxisType
+
+import raymanifold_jax as rm
+from raymanifold_jax.blocks import even, full, make_moves, positions
+from raymanifold_jax.direct import sky_inflow
+from raymanifold_jax.layout import Layout, make_ordinates
+from raymanifold_jax.operator import materials
+from raymanifold_jax.partition import FIELD, make_partition
+from raymanifold_jax.placement import known, restored, stored
+from raymanifold_jax.prepare import prepare
+from raymanifold_jax.shift import shift
+from raymanifold_jax.transport.characteristic import SweptMedium, _planes
+from raymanifold_jax.transport.sharded import adjoint_over, laps_over, mark_over, plane_size, slopes_over, sweep_over
+
+_EXACT = 1e-12
+_QUADRATURE = rm.quadrature.fibonacci(48)
+
+
+def scene(kind: str, shape: tuple[int, int, int]) -> rm.Scene:
+    wall = rm.Wall(albedo=0.6)
+    sides = {
+        "open": rm.Boundary(x=(wall, rm.OPEN), y=(rm.OPEN, wall), z=(wall, rm.OPEN)),
+        "mirror": rm.Boundary(x=(rm.MIRROR, rm.OPEN), y=(rm.OPEN, rm.MIRROR), z=(rm.MIRROR, wall)),
+        "periodic": rm.Boundary(x=rm.PERIODIC, y=rm.PERIODIC, z=rm.PERIODIC),
+        "mixed": rm.Boundary(x=(rm.MIRROR, rm.MIRROR), y=rm.PERIODIC, z=(wall, rm.OPEN)),
+    }[kind]
+    ball = rm.Solid(rm.Sphere((0.45, 0.5, 0.4), 0.25), albedo=0.7, emission=0.5)
+    lights = [] if kind == "periodic" else [rm.Sky(radiance=1.0)]
+    lattice = rm.Lattice(shape, spacing=1 / shape[0])
+    # Voxels more than 0.1 free paths thick: scattered light has slopes.
+    return rm.Scene(lattice, [ball], medium=rm.Medium(scattering=2.0, absorption=0.5), lights=lights, boundary=sides)
+
+
+def close(mesh: object, one: object, tolerance: float = _EXACT) -> None:
+    for a, b in zip(jax.tree.leaves(mesh), jax.tree.leaves(one), strict=True):
+        a, b = known(a), np.asarray(b)
+        assert a.shape == b.shape
+        np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * max(1.0, np.abs(b).max()))
+
+
+def mesh_of(nu: int, nv: int):
+    return rm.pe_array(nu, nv)
+
+
+def test_blocks_hold_every_column_once():
+    for count, parts in ((7, 4), (8, 4), (4, 4), (9, 2), (5, 1)):
+        for table in (even(count, parts, 2), full(count, parts)):
+            assert sorted(table[table >= 0]) == list(range(count))
+            np.testing.assert_array_equal(table.ravel()[positions(table)], np.arange(count))
+        assert np.all(even(count, parts)[:, 0] >= 0)  # a ring has no gap
+
+
+def test_columns_move_between_splits():
+    """To mirrored, padded blocks and to plain ones: what arrives is what was asked for."""
+    mesh = mesh_of(4, 2)
+    source = full(6, 4)
+    wanted = even(14, 4)
+    image = np.concatenate([[-1], np.arange(6), np.arange(6)[::-1], [-1]])
+    wanted = np.where(wanted >= 0, image[wanted], -1)
+    moves = make_moves("u", source, wanted)
+    values = np.where(source >= 0, 10.0 + source, 0.0).ravel()
+    spec = jax.sharding.PartitionSpec("u")
+    got = jax.jit(jax.shard_map(lambda f: moves(f, 0), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False))(values)
+    np.testing.assert_array_equal(got, np.where(wanted >= 0, 10.0 + wanted, 0.0).ravel())
+
+
+@pytest.mark.parametrize("kind, shape", [("mixed", (3, 7, 4)), ("open", (7, 5, 6))])
+def test_planes_of_blocks_are_the_planes_of_the_lattice(kind, shape):
+    """Turned to each sweep axis and back, in uneven blocks; unfolded and padded like on one device."""
+    if kind == "mixed":
+        shape = (4, 7, 4)
+    layout = prepare(scene(kind, shape)).layout
+    partition = make_partition(layout, mesh_of(4, 2))
+    field = np.random.default_rng(0).random((2, *shape)).astype(np.float32)
+    padded = partition.to_padded(stored(partition, jnp.asarray(field)))
+    expected = np.asarray(layout.to_padded(jnp.asarray(field)))
+    rows, columns = (positions(partition.shapes.split(axis, name)) for axis, name in enumerate("uv"))
+    np.testing.assert_array_equal(np.asarray(padded)[:, rows][:, :, columns], expected)
+    close(restored(partition, partition.from_padded(padded)), layout.from_padded(jnp.asarray(expected)), 1e-6)
+    for axis, (_, u, v) in enumerate(((0, 1, 2), (1, 2, 0), (2, 0, 1))):
+
+        def turned(block, _, field, __, axis=axis):
+            planes = block.planes(field, axis)
+            _, height, width = block.padded_along(axis)
+            back = block.from_planes(planes, axis)
+            return planes.reshape(*planes.shape[:2], height, width), back
+
+        out = (jax.sharding.PartitionSpec(None, None, "u", "v"), FIELD)
+        planes, back = jax.jit(lambda f, turned=turned, out=out: partition.on_blocks(turned, (), f, (), out))(padded)
+        rows, columns = (positions(partition.shapes.split(a, name)) for a, name in ((u, "u"), (v, "v")))
+        picked = np.asarray(planes)[:, :, rows][:, :, :, columns]
+        np.testing.assert_array_equal(picked.reshape(*picked.shape[:2], -1), _planes(jnp.asarray(expected), axis))
+        close(back, padded, 0.0)
+
+
+@pytest.mark.parametrize("nu, nv", [(4, 2), (1, 2), (2, 1)])
+def test_rays_move_around_the_ring_as_on_one_device(nu, nv):
+    """A periodic plane of 7 x 5 voxels in uneven blocks."""
+    from raymanifold_jax.shift import Ring
+
+    height, width = 7, 5
+    rows, columns = even(height, nu), even(width, nv, 2)
+    values = np.random.default_rng(1).random((5, 1, height, width))
+    moves = np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
+    offsets = jnp.asarray(moves @ [width, 1])
+    expected = shift(jnp.asarray(values.reshape(5, 1, -1)), offsets, width, True).reshape(values.shape)
+    blocked = values[:, :, np.maximum(rows, 0).ravel()][:, :, :, np.maximum(columns, 0).ravel()]
+    size = rows.shape[1], columns.shape[1]
+
+    def local(values):
+        here = jax.lax.axis_index("u"), jax.lax.axis_index("v")
+        used = [jnp.sum(jnp.asarray(table)[i] >= 0) for table, i in zip((rows, columns), here, strict=True)]
+        flat = jnp.asarray(moves @ [size[1], 1])
+        moved = shift(values.reshape(5, 1, -1), flat, size[1], False, Ring(*size, used[0], used[1], (nu, nv)))
+        return moved.reshape(values.shape)
+
+    spec = jax.sharding.PartitionSpec(None, None, "u", "v")
+    got = jax.jit(jax.shard_map(local, mesh=mesh_of(nu, nv), in_specs=spec, out_specs=spec, check_vma=False))(blocked)
+    np.testing.assert_array_equal(got[:, :, positions(rows)][:, :, :, positions(columns)], expected)
+
+
+def both_ways(layout, of: rm.Scene, transposed: bool):
+    """A sweep with slopes and a sky, and its transpose; and the text of the compiled sweep."""
+    rng = np.random.default_rng(2)
+    prepared = prepare(of)
+    stuff = materials(of, prepared.surfaces)
+    extinction, albedo = stored(layout, (stuff.extinction, stuff.scattering_albedo))
+    ordinates = mark_over(layout, make_ordinates(_QUADRATURE.mirrored(layout.unfolding.axes), 1, plane_size(layout)))
+    padded = layout.to_padded(extinction)
+    ordinates, longest = jax.jit(laps_over, static_argnums=3)(layout, ordinates, padded, 100)
+    exitance = stored(layout, jnp.asarray(rng.random((1, layout.elements))))
+    source = stored(layout, jnp.asarray(rng.random((1, *of.lattice.shape))))
+    inflow = sky_inflow(of, layout, _QUADRATURE)
+
+    def run(layout, ordinates, padded, exitance, source):
+        slopes = slopes_over(layout, source, albedo, padded)
+        medium = SweptMedium(padded, layout.to_padded(source), False, slopes, True)
+        return sweep_over(layout, ordinates, exitance, medium, inflow, True)
+
+    def back(layout, ordinates, padded, exitance, source):
+        zero = jnp.zeros_like(padded)
+        found = adjoint_over(layout, ordinates, exitance, source, None, SweptMedium(padded, zero, False, (zero,) * 3, True))
+        return found.exitance, found.source, [layout.from_padded(s) for s in found.slopes]
+
+    compiled = jax.jit(run).lower(layout, ordinates, padded, exitance, source).compile()
+    results = [compiled(layout, ordinates, padded, exitance, source)]
+    if transposed:
+        results.append(jax.jit(back)(layout, ordinates, padded, exitance, source))
+    return restored(layout, results), int(longest), compiled.as_text()
+
+
+def agree(kind: str, shape: tuple[int, int, int], meshes, transposed: bool) -> None:
+    of = scene(kind, shape)
+    layout = prepare(of).layout
+    expected, laps, _ = both_ways(layout, of, transposed)
+    for nu, nv in meshes:
+        partition = make_partition(layout, mesh_of(nu, nv))
+        found, laps_here, text = both_ways(partition, of, transposed)
+        assert laps_here == laps
+        close(found, expected)
+        if nu * nv > 1:
+            gathers_no_field(text, layout)
+
+
+def gathers_no_field(text: str, layout: Layout) -> None:
+    """The compiled program gathers nothing larger than a value an element, and does exchange rims."""
+    assert "collective-permute" in text
+    for found in re.finditer(r"= \(?(\w+)\[([\d,]*)\][^=\n]* all-gather(?:-start)?\(", text):
+        size = np.prod([int(n) for n in found.group(2).split(",") if n])
+        assert size <= layout.elements, found.group(0)
+
+
+def test_a_sweep_and_its_transpose_over_uneven_blocks(x64):
+    agree("open", (7, 7, 7), [(4, 2)], transposed=True)
+
+
+def test_a_sweep_around_a_periodic_lattice_in_uneven_blocks(x64):
+    agree("periodic", (7, 7, 7), [(4, 2)], transposed=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kind, shape", [("open", (8, 9, 10)), ("mirror", (5, 5, 5)), ("periodic", (6, 6, 6)), ("mixed", (5, 7, 6))]
+)
+def test_sweeps_over_many_meshes(x64, kind, shape):
+    agree(kind, shape, [(1, 1), (2, 1), (1, 4), (4, 2)], transposed=True)
+
+
+def _quantities(parameters, kind, shape, mesh):
+    """Two numbers of a solution: they hang on every bounce."""
+    of = scene(kind, shape)
+    ball = rm.Solid(of.solids[0].shape, albedo=parameters[0], emission=0.5)
+    medium = rm.Medium(scattering=parameters[1], absorption=0.5)
+    lights = [*of.lights, rm.PointLight((0.8, 0.8, 0.8), intensity=parameters[2])]
+    of = rm.Scene(of.lattice, [ball], medium=medium, lights=lights, boundary=of.boundary)
+    solution = rm.solve(of, _QUADRATURE, rtol=1e-10, mesh=mesh, progress=False)
+    return jnp.mean(solution.fluence) + jnp.mean(solution.surfaces.irradiance), solution.fluence
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "kind, shape, nu, nv",
+    [("open", (8, 8, 8), 1, 1), ("open", (8, 8, 8), 4, 2), ("mirror", (5, 5, 5), 2, 2), ("mixed", (5, 7, 6), 1, 4)],
+)
+def test_solutions_and_gradients_do_not_depend_on_the_mesh(x64, kind, shape, nu, nv):
+    """Solved to 1e-10, which the bound on the iteration's error keeps; derivatives' residuals are a tenth of that."""
+    parameters = jnp.array([0.7, 2.0, 1.5])
+    run = lambda mesh: jax.value_and_grad(_quantities, has_aux=True)(parameters, kind, shape, mesh)
+    close(run(mesh_of(nu, nv)), run(None), 1e-8)
+
+
+def test_a_mesh_that_cannot_be_used_is_refused():
+    of = scene("open", (4, 4, 4))
+    other = jax.make_mesh((2, 2), ("x", "y"), axis_types=(AxisType.Auto,) * 2)
+    with pytest.raises(ValueError, match=r"mesh: got axes \('x', 'y'\), expected axes \('u', 'v'\)"):
+        rm.solve(of, mesh=other)
+    with pytest.raises(ValueError, match="8 x 1 elements for 4 x 4 x 4 voxels, expected at most 4 elements a side"):
+        rm.solve(of, mesh=mesh_of(8, 1))
+    with pytest.raises(TypeError, match="pe_array"):
+        rm.solve(of, mesh=(4, 2))
+    with pytest.raises(ValueError, match="the paper's scheme runs on one device"):
+        rm.solve(of, scheme=rm.LightRayCube(1), mesh=mesh_of(2, 1))
+    with pytest.raises(ValueError, match="16 x 2 elements, expected at most the 8 CPU .* JAX_NUM_CPU_DEVICES=32"):
+        rm.pe_array(16, 2)
+    with pytest.raises(ValueError, match="nu"):
+        rm.pe_array(0, 2)
+
+    def traced(radiance):
+        lit = rm.Scene(of.lattice, lights=[rm.Sky(radiance)], boundary=of.boundary)
+        return rm.solve(lit, mesh=mesh_of(2, 1)).fluence
+
+    with pytest.raises(TypeError, match="under jit"):
+        jax.jit(traced)(1.0)
+
+
+def test_devices_are_made_before_jax_starts():
+    """In a process of its own, because JAX starts once."""
+    code = "import raymanifold_jax as rm; import jax; print(dict(rm.pe_array(3, 2).shape), jax.device_count())"
+    environment = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES")}
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=120)
+    assert found.stdout.strip() == "{'u': 3, 'v': 2} 6", found.stderr
