@@ -297,7 +297,8 @@ def _make_transport(
             )
     ones = lambda *shape: jnp.ones((bands, *shape), layout.plane.dtype)
     transport = Transport(layout, ordinates, padded, ones(), ones(), ones(), thin, thick and not beam)
-    sums = _furnace(transport, stored(layout, Light(ones(layout.elements), None if extinction is None else ones(*layout.shape))))
+    leaving = Light(ones(layout.elements), None if extinction is None else ones(*layout.shape))
+    sums = _furnace(transport, stored(layout, leaving))
     assert sums.voxels is not None
     fields = {"element_sums": sums.elements, "voxel_sums": sums.voxels, "coverage": sums.voxels[0]}
     transport = dataclasses.replace(transport, **fields)

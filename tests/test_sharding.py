@@ -1,8 +1,8 @@
 """A mesh of devices computes what one device does.
 
-Sums over directions and elements are added up in another order there, and nothing else: results agree to a few units in the last
-place of float64 (1e-12 of the largest value; what a wrong neighbour or a lost ray costs is 1e-3 or more). `tests/conftest.py`
-makes 8 virtual devices.
+Sums over directions and elements are added up in another order there, and nothing else: results agree to a few units in the
+last place of float64 (1e-12 of the largest value; what a wrong neighbour or a lost ray costs is 1e-3 or more).
+`tests/conftest.py` makes 8 virtual devices.
 """
 
 import os
@@ -190,13 +190,9 @@ def test_a_sweep_and_its_transpose_over_uneven_blocks(x64):
     agree("open", (7, 7, 7), [(4, 2)], transposed=True)
 
 
-def test_a_sweep_around_a_periodic_lattice_in_uneven_blocks(x64):
-    agree("periodic", (7, 7, 7), [(4, 2)], transposed=False)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "kind, shape", [("open", (8, 9, 10)), ("mirror", (5, 5, 5)), ("periodic", (6, 6, 6)), ("mixed", (5, 7, 6))]
+    "kind, shape", [("open", (8, 9, 10)), ("mirror", (5, 5, 5)), ("periodic", (7, 7, 7)), ("mixed", (5, 7, 6))]
 )
 def test_sweeps_over_many_meshes(x64, kind, shape):
     agree(kind, shape, [(1, 1), (2, 1), (1, 4), (4, 2)], transposed=True)
@@ -236,7 +232,7 @@ def test_a_mesh_that_cannot_be_used_is_refused():
         rm.solve(of, mesh=(4, 2))
     with pytest.raises(ValueError, match="the paper's scheme runs on one device"):
         rm.solve(of, scheme=rm.LightRayCube(1), mesh=mesh_of(2, 1))
-    with pytest.raises(ValueError, match="16 x 2 elements, expected at most the 8 CPU .* JAX_NUM_CPU_DEVICES=32"):
+    with pytest.raises(ValueError, match=r"16 x 2 elements, expected at most the 8 CPU .* JAX_NUM_CPU_DEVICES=32"):
         rm.pe_array(16, 2)
     with pytest.raises(ValueError, match="nu"):
         rm.pe_array(0, 2)
