@@ -4,12 +4,13 @@ A solve on a mesh prepares geometry and materials on one device (the default one
 the mesh's blocks (`partition`), and hands its solution back on one device. Both ways are linear, each the other's transpose, so
 gradients go through.
 
-Public: `stored`, `restored`, `known`.
+Public: `stored`, `restored`, `known`, `check_agreement`.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 from typing import Any, TypeVar
 
 import jax
@@ -20,6 +21,7 @@ from jax.sharding import Mesh
 from jax.sharding import PartitionSpec as Spec
 from jaxtyping import Array
 
+from . import checks
 from .adjoint import linear
 from .layout import Layout
 from .partition import Partition, put
@@ -50,6 +52,21 @@ def known(array: Array) -> np.ndarray:
     if array.is_fully_addressable or array.is_fully_replicated:
         return np.asarray(array)
     return np.asarray(multihost_utils.process_allgather(array, tiled=True))
+
+
+def check_agreement(name: str, tree: Any) -> None:
+    """Refuse to go on where processes of one run hold different numbers: they would wait for one another, or mix results."""
+    if jax.process_count() == 1:
+        return
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        values = np.asarray(leaf)
+        digest.update(f"{values.shape} {values.dtype}".encode() + values.tobytes())
+    found = multihost_utils.process_allgather(np.frombuffer(digest.digest(), np.uint32))
+    different = [number for number, row in enumerate(np.asarray(found)) if np.any(row != found[0])]
+    if different:
+        got = f"another one in process(es) {', '.join(map(str, different))} than in process 0"
+        checks.fail(name, got, "the same in every process", "have all processes make it in the same way, without chance")
 
 
 def _moved(partition: Partition, array: Array, to_mesh: bool) -> Array:

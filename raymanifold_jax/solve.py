@@ -28,7 +28,7 @@ from .iteration import Iteration, System, certify
 from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
 from .optimistix_solver import OptimistixFixedPoint
-from .placement import restored, stored
+from .placement import check_agreement, restored, stored
 from .prepare import Prepared, prepare
 from .progress import Progress, make_progress
 from .quadrature import Quadrature, for_scene
@@ -100,6 +100,9 @@ def solve(
             check_sources(scene, surfaces)
         stuff = materials(scene, surfaces)
         _check_steady(scene, surfaces, stuff)
+        if mesh is not None:
+            geometry = (surfaces.position, surfaces.normal, surfaces.area)
+            check_agreement("scene", stop_gradient((geometry, stuff, quadrature.directions, float(rtol))))
         nodes = None if cube is None else make_cube_system(scene, surfaces, cube)
         if nodes is not None:
             system, quadrature = nodes.system, nodes.quadrature

@@ -7,8 +7,10 @@ last place of float64 (1e-12 of the largest value; what a wrong neighbour or a l
 
 import os
 import re
+import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +26,7 @@ from raymanifold_jax.operator import materials
 from raymanifold_jax.partition import FIELD, make_partition
 from raymanifold_jax.placement import known, restored, stored
 from raymanifold_jax.prepare import prepare
-from raymanifold_jax.shift import shift
+from raymanifold_jax.shift import Ring, shift
 from raymanifold_jax.transport.characteristic import SweptMedium, _planes
 from raymanifold_jax.transport.sharded import adjoint_over, laps_over, mark_over, plane_size, slopes_over, sweep_over
 
@@ -54,10 +56,6 @@ def close(mesh: object, one: object, tolerance: float = _EXACT) -> None:
         np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * max(1.0, np.abs(b).max()))
 
 
-def mesh_of(nu: int, nv: int):
-    return rm.pe_array(nu, nv)
-
-
 def test_blocks_hold_every_column_once():
     for count, parts in ((7, 4), (8, 4), (4, 4), (9, 2), (5, 1)):
         for table in (even(count, parts, 2), full(count, parts)):
@@ -68,7 +66,7 @@ def test_blocks_hold_every_column_once():
 
 def test_columns_move_between_splits():
     """To mirrored, padded blocks and to plain ones: what arrives is what was asked for."""
-    mesh = mesh_of(4, 2)
+    mesh = rm.pe_array(4, 2)
     source = full(6, 4)
     wanted = even(14, 4)
     image = np.concatenate([[-1], np.arange(6), np.arange(6)[::-1], [-1]])
@@ -86,7 +84,7 @@ def test_planes_of_blocks_are_the_planes_of_the_lattice(kind, shape):
     if kind == "mixed":
         shape = (4, 7, 4)
     layout = prepare(scene(kind, shape)).layout
-    partition = make_partition(layout, mesh_of(4, 2))
+    partition = make_partition(layout, rm.pe_array(4, 2))
     field = np.random.default_rng(0).random((2, *shape)).astype(np.float32)
     padded = partition.to_padded(stored(partition, jnp.asarray(field)))
     expected = np.asarray(layout.to_padded(jnp.asarray(field)))
@@ -112,8 +110,6 @@ def test_planes_of_blocks_are_the_planes_of_the_lattice(kind, shape):
 @pytest.mark.parametrize("nu, nv", [(4, 2), (1, 2), (2, 1)])
 def test_rays_move_around_the_ring_as_on_one_device(nu, nv):
     """A periodic plane of 7 x 5 voxels in uneven blocks."""
-    from raymanifold_jax.shift import Ring
-
     height, width = 7, 5
     rows, columns = even(height, nu), even(width, nv, 2)
     values = np.random.default_rng(1).random((5, 1, height, width))
@@ -131,7 +127,7 @@ def test_rays_move_around_the_ring_as_on_one_device(nu, nv):
         return moved.reshape(values.shape)
 
     spec = jax.sharding.PartitionSpec(None, None, "u", "v")
-    got = jax.jit(jax.shard_map(local, mesh=mesh_of(nu, nv), in_specs=spec, out_specs=spec, check_vma=False))(blocked)
+    got = jax.jit(jax.shard_map(local, mesh=rm.pe_array(nu, nv), in_specs=spec, out_specs=spec, check_vma=False))(blocked)
     np.testing.assert_array_equal(got[:, :, positions(rows)][:, :, :, positions(columns)], expected)
 
 
@@ -170,7 +166,7 @@ def agree(kind: str, shape: tuple[int, int, int], meshes, transposed: bool) -> N
     layout = prepare(of).layout
     expected, laps, _ = both_ways(layout, of, transposed)
     for nu, nv in meshes:
-        partition = make_partition(layout, mesh_of(nu, nv))
+        partition = make_partition(layout, rm.pe_array(nu, nv))
         found, laps_here, text = both_ways(partition, of, transposed)
         assert laps_here == laps
         close(found, expected)
@@ -218,7 +214,7 @@ def test_solutions_and_gradients_do_not_depend_on_the_mesh(x64, kind, shape, nu,
     """Solved to 1e-10, which the bound on the iteration's error keeps; derivatives' residuals are a tenth of that."""
     parameters = jnp.array([0.7, 2.0, 1.5])
     run = lambda mesh: jax.value_and_grad(_quantities, has_aux=True)(parameters, kind, shape, mesh)
-    close(run(mesh_of(nu, nv)), run(None), 1e-8)
+    close(run(rm.pe_array(nu, nv)), run(None), 1e-8)
 
 
 def test_a_mesh_that_cannot_be_used_is_refused():
@@ -227,11 +223,11 @@ def test_a_mesh_that_cannot_be_used_is_refused():
     with pytest.raises(ValueError, match=r"mesh: got axes \('x', 'y'\), expected axes \('u', 'v'\)"):
         rm.solve(of, mesh=other)
     with pytest.raises(ValueError, match="8 x 1 elements for 4 x 4 x 4 voxels, expected at most 4 elements a side"):
-        rm.solve(of, mesh=mesh_of(8, 1))
+        rm.solve(of, mesh=rm.pe_array(8, 1))
     with pytest.raises(TypeError, match="pe_array"):
         rm.solve(of, mesh=(4, 2))
     with pytest.raises(ValueError, match="the paper's scheme runs on one device"):
-        rm.solve(of, scheme=rm.LightRayCube(1), mesh=mesh_of(2, 1))
+        rm.solve(of, scheme=rm.LightRayCube(1), mesh=rm.pe_array(2, 1))
     with pytest.raises(ValueError, match=r"16 x 2 elements, expected at most the 8 CPU .* JAX_NUM_CPU_DEVICES=32"):
         rm.pe_array(16, 2)
     with pytest.raises(ValueError, match="nu"):
@@ -239,15 +235,66 @@ def test_a_mesh_that_cannot_be_used_is_refused():
 
     def traced(radiance):
         lit = rm.Scene(of.lattice, lights=[rm.Sky(radiance)], boundary=of.boundary)
-        return rm.solve(lit, mesh=mesh_of(2, 1)).fluence
+        return rm.solve(lit, mesh=rm.pe_array(2, 1)).fluence
 
     with pytest.raises(TypeError, match="under jit"):
         jax.jit(traced)(1.0)
 
 
+def own_environment() -> dict[str, str]:
+    """For a process that makes its devices itself."""
+    inherited = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES")}
+    return inherited | {"PYTHONPATH": str(Path(rm.__file__).parents[1])}
+
+
 def test_devices_are_made_before_jax_starts():
     """In a process of its own, because JAX starts once."""
     code = "import raymanifold_jax as rm; import jax; print(dict(rm.pe_array(3, 2).shape), jax.device_count())"
-    environment = {k: v for k, v in os.environ.items() if k not in ("XLA_FLAGS", "JAX_NUM_CPU_DEVICES")}
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment, timeout=120)
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=own_environment(), timeout=120)
     assert found.stdout.strip() == "{'u': 3, 'v': 2} 6", found.stderr
+
+
+def processes(folder: Path, **signals: str) -> list[tuple[str, int]]:
+    """What two processes of two devices each print, and their exit codes; the files they write are in `folder`."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    script = Path(__file__).with_name("two_processes.py")
+    command = lambda n: [sys.executable, str(script), "2", str(n), str(port), str(folder / f"{n}.npz")]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "env": own_environment() | signals}
+    started = [subprocess.Popen(command(n), **pipes) for n in range(2)]
+    try:
+        return [(p.communicate(timeout=900)[0], p.returncode) for p in started]
+    finally:
+        for process in started:
+            process.kill()
+
+
+@pytest.mark.slow
+def test_two_processes_solve_what_one_does(tmp_path):
+    """In float32: 1e-5, some hundred units in the last place, where other compilers' choices are summed in 8 sweeps."""
+    for text, code in processes(tmp_path):
+        assert code == 0, text
+    subprocess.run(
+        [sys.executable, str(Path(__file__).with_name("two_processes.py")), str(tmp_path / "one.npz")],
+        timeout=900, check=True, env=own_environment(),
+    )  # fmt: skip
+    first, second, expected = (np.load(tmp_path / f"{name}.npz") for name in ("0", "1", "one"))
+    for key in ("fluence", "irradiance"):
+        np.testing.assert_array_equal(first[key], second[key])
+        np.testing.assert_allclose(first[key], expected[key], rtol=0, atol=1e-5 * expected[key].max())
+
+
+@pytest.mark.slow
+def test_a_peer_that_dies_ends_the_other_with_an_error(tmp_path):
+    (text, code), (_, killed) = processes(tmp_path, DIES="1")
+    assert killed == 3
+    assert code != 0 and "Error" in text
+    assert not (tmp_path / "0.npz").exists()
+
+
+@pytest.mark.slow
+def test_processes_that_disagree_on_the_scene_are_told(tmp_path):
+    for text, code in processes(tmp_path, ALTERS="1"):
+        assert code != 0
+        assert "scene: got another one in process(es) 1 than in process 0" in text
