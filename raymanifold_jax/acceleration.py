@@ -24,7 +24,6 @@ Public: `Diffusion`, `make_diffusion`.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import equinox as eqx
@@ -149,13 +148,18 @@ def _elimination(near: Diffusion) -> tuple[Array, Array]:
 
 def _above(near: Diffusion, voxels: Array) -> Array:
     """Values of voxels at the elements that hang on them."""
-    return voxels.reshape(len(voxels), -1)[:, near.probe]
+    return voxels[:, *_where(near, voxels.shape)]
 
 
 def _gathered(near: Diffusion, elements: Array) -> Array:
     """In each voxel the sum over the elements that hang on it."""
     shape = near.levels[0].loss.shape
-    return jnp.zeros((shape[0], math.prod(shape[1:])), elements.dtype).at[:, near.probe].add(elements).reshape(shape)
+    return jnp.zeros(shape, elements.dtype).at[:, *_where(near, shape)].add(elements)
+
+
+def _where(near: Diffusion, shape: tuple[int, ...]) -> tuple[Array, ...]:
+    # By three indices: on a mesh, flat fields would have to be gathered from their blocks.
+    return jnp.unravel_index(near.probe, shape[1:])
 
 
 def _conjugate_gradients(levels: tuple[_Level, ...], right: Array) -> Array:

@@ -1,4 +1,4 @@
-"""One process of a solve over several (run by `test_sharding.py`): PROCESSES NUMBER PORT FILE, or "one" FILE.
+"""One process of a solve over several (run by `test_sharding.py`): PROCESSES NUMBER PORT FILE, or FILE for one process.
 
 The mesh is 2 x 2: two processes with two virtual devices each, or one with four.
 """
