@@ -29,7 +29,7 @@ UNEVEN = rm.quadrature.Quadrature([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], [1.0, 1.0
             r"solver: got 'gmres', expected rm\.Krylov\(\), rm\.Anderson\(\), .* or \"auto\"",
         ),
         (SCENE, {"solver": None}, ValueError, r"solver: got None"),
-        (SCENE, {"mesh": 4}, ValueError, r"mesh: got 4, expected None"),
+        (SCENE, {"mesh": 4}, TypeError, r"mesh: got 4 \(int\), expected Mesh"),
         (SCENE, {"max_sweeps": 0}, ValueError, r"max_sweeps: got 0, expected a whole number >= 1"),
         (SCENE, {"max_sweeps": -3}, ValueError, r"max_sweeps: got -3"),
         (SCENE, {"max_sweeps": 2.5}, TypeError, r"max_sweeps: got 2\.5, expected a whole number"),

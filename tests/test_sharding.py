@@ -188,10 +188,16 @@ def test_a_sweep_and_its_transpose_over_uneven_blocks(x64):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "kind, shape", [("open", (8, 9, 10)), ("mirror", (5, 5, 5)), ("periodic", (7, 7, 7)), ("mixed", (5, 7, 6))]
+    "kind, shape, meshes",
+    [
+        ("open", (8, 8, 8), [(1, 1), (2, 1), (1, 4), (2, 4)]),
+        ("mirror", (5, 5, 5), [(4, 2)]),
+        ("periodic", (7, 7, 7), [(4, 2)]),
+        ("mixed", (5, 7, 6), [(1, 4)]),
+    ],
 )
-def test_sweeps_over_many_meshes(x64, kind, shape):
-    agree(kind, shape, [(1, 1), (2, 1), (1, 4), (4, 2)], transposed=True)
+def test_sweeps_over_many_meshes(x64, kind, shape, meshes):
+    agree(kind, shape, meshes, transposed=True)
 
 
 def _quantities(parameters, kind, shape, mesh):
@@ -208,7 +214,7 @@ def _quantities(parameters, kind, shape, mesh):
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "kind, shape, nu, nv",
-    [("open", (8, 8, 8), 1, 1), ("open", (8, 8, 8), 4, 2), ("mirror", (5, 5, 5), 2, 2), ("mixed", (5, 7, 6), 1, 4)],
+    [("open", (8, 8, 8), 4, 2), ("mixed", (5, 7, 6), 1, 4)],
 )
 def test_solutions_and_gradients_do_not_depend_on_the_mesh(x64, kind, shape, nu, nv):
     """Solved to 1e-10, which the bound on the iteration's error keeps; derivatives' residuals are a tenth of that."""
