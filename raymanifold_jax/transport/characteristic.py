@@ -513,8 +513,10 @@ def _read_tile(tile, reads: Reads, bits, own: Ordinates, chords: Chords, plane: 
     voxels = plane.cells(cell)
 
     def value(radiance, sent):
-        mean = mean_of(radiance, voxels.sending(sent), face, chords, length[:, None, None])
-        return jnp.sum(weight[:, None] * mean, axis=0)
+        # Gathered once, not anew for every use; and summed as a product with ones: XLA vectorises neither otherwise.
+        radiance, here = lax.optimization_barrier((radiance, voxels.sending(sent)))
+        mean = mean_of(radiance, here, face, chords, length[:, None, None])
+        return jnp.tensordot(jnp.ones_like(own.weight), weight[:, None] * mean, 1)
 
     return _TileRead(cell, value)
 
@@ -559,8 +561,6 @@ def _mean_of_paths(radiance, plane: _Fields, face, chords: Chords, length) -> Fl
     towards = -_height((0.0, *face[1:4]), chords.step)
     # A step is as long as the rays' slant makes it.
     spacing = length / jnp.sqrt(sum(x**2 for x in chords.step))[:, None, None]
-    # Gathered once, not anew for every use.
-    radiance, plane = lax.optimization_barrier((radiance, plane))
     facing = _facing(plane, chords)
     for number, ends in enumerate(chords.ends):
         share = chords.share[number][:, None, None]
