@@ -38,7 +38,7 @@ _ENOUGH = 0.5  # w - K w of at least this ends the search for w
 _SEARCH = 24  # sweeps of it at most
 _STALLED = 24  # sweeps without a new smallest residual before giving up
 _GROWN = 1e3  # times the first residual: diverged
-_HOPED = 0.05  # what polishing is at first taken to make of a bound
+_HOPED = 0.2  # what polishing is at first taken to make of a bound: rather late than twice
 _ROUNDING = 2.0  # units in the last place by which a sweep's result may be off, of the largest radiance
 
 
