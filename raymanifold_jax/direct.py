@@ -45,6 +45,7 @@ class Direct(eqx.Module):
 
     sun: Light
     rest: Light
+    brightest: Float[Array, ""]  # radiance sent into the lattice by skies, and irradiance of suns, at most
 
 
 def first_flight(
@@ -75,7 +76,13 @@ def first_flight(
             swept = swept + _from_point(scene, surfaces, light)
     zero = jax.tree.map(jnp.zeros_like, swept)
     suns = [_from_sun(scene, surfaces, layout, light, materials, prepared) for light in scene.lights if isinstance(light, Sun)]
-    return Direct(sun=sum(suns, start=zero), rest=swept)
+    return Direct(sun=sum(suns, start=zero), rest=swept, brightest=brightest(scene, None if sky is None else sky.radiance))
+
+
+def brightest(scene: Scene, sky: Array | None) -> Float[Array, ""]:
+    """The largest of the radiances of the sky and of the irradiances of suns."""
+    sent = [light.irradiance for light in scene.lights if isinstance(light, Sun)] + ([] if sky is None else [sky])
+    return jnp.stack([jnp.zeros(()), *(jnp.max(jnp.asarray(value, float)) for value in sent)]).max()
 
 
 def _swept(transport: Transport, leaving: Light, sky: Inflow | None) -> Light:

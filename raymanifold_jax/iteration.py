@@ -229,10 +229,15 @@ class Iteration:
 
     @property
     def rounding(self) -> float:
-        """What the float type's rounding in the sweeps may add to the error, by the same bound."""
-        eps = float(jnp.finfo(self.residual.elements.dtype).eps)
-        largest = self.target / self._rtol
-        return _ROUNDING * eps * (1 + self.certificate.factor) * largest if largest > 0 else 0.0
+        """What the float type's rounding in the sweeps may add to the error, by the same bound.
+
+        Light that a medium takes up before it arrives anywhere counts: what is left of it is as exact as it was bright. So
+        does what is too faint for the type.
+        """
+        limits = jnp.finfo(self.residual.elements.dtype)
+        largest = max(self.target / self._rtol, float(self.system.direct.brightest))
+        faint = float(limits.tiny) if largest > 0 else 0.0
+        return _ROUNDING * (float(limits.eps) * largest + faint) * (1 + self.certificate.factor)
 
     @property
     def converged(self) -> bool:
