@@ -479,7 +479,7 @@ def _cross(rays, chords: Chords, fields: _Fields, length, entering, track: _Trac
             rays = shift(lax.optimization_barrier(rays), chords.offsets[number - 1], track.width, track.wrap_v)
         starts.append(rays)
         rays, passed = _segment(number, rays, chords, fields, plane, length, entering, track, fluence)
-        passing = passed if passing is None else passing + passed
+        passing = passed if passing is None or passed is None else passing + passed
     return starts, rays, passing
 
 
@@ -505,7 +505,7 @@ def _uncross(chords: Chords, fields: _Fields, length, entering, track: _Track, c
     return rays, jax.tree.map(lambda a: jnp.tensordot(jnp.ones(number_of, a.dtype), a, 1), sent), light
 
 
-def _segment(number: int, rays, chords: Chords, fields: _Fields, plane: _Plane | None, length, entering, track: _Track, fluence):
+def _segment(number: int, rays, chords: Chords, fields: _Fields, plane: _Plane | None, length, entering, track, fluence: bool):
     """Carry rays through their segment `number` in a plane; also, with `fluence`, their path means there."""
     emitted = fields.exitance if entering is None else fields.exitance + entering
     share = chords.share[number][:, None, None]
