@@ -36,7 +36,8 @@ from .transport.characteristic import Inflow
 from .volume_sources import VolumeSources, compact_sources, volume_light
 
 _SUN_OFFSETS = 4  # rays a voxel, a side
-_EMITTER_POINTS = 576
+_EMITTER_POINTS = 576  # for readings
+_FEWER_POINTS = 256  # for elements: what bounces is smooth
 _SMALL = 0.1  # emitters that cover less of the surfaces than this are sampled by points
 _NEAR = 6  # widths of an emitter point's area
 _PAIRS = 1 << 18  # receiver-point pairs at once
@@ -47,6 +48,7 @@ class Direct(eqx.Module):
 
     sun: Light
     rest: Light
+    brightest: Float[Array, ""]  # radiance sent into the lattice by skies, and irradiance of suns, at most
 
 
 def first_flight(
@@ -66,7 +68,7 @@ def first_flight(
     if compact is not None and glow is not None:
         glow = jnp.where(stored(layout, jnp.asarray(compact.emits)), 0.0, glow)
     swept = _swept(transport, Light(materials.emission, glow), sky)
-    if (points := small_emitters(scene, surfaces)) is not None:
+    if (points := small_emitters(scene, surfaces, _FEWER_POINTS)) is not None:
         # The elements' share of the emitters' light is taken exactly; the sweep's share of it is taken out.
         others = _swept(transport, Light(dark.elements, glow), sky).elements
         swept = Light(others + stored(layout, _conserved(scene, surfaces, points) / jnp.pi), swept.voxels)
@@ -77,7 +79,13 @@ def first_flight(
             swept = swept + stored(layout, _from_point(scene, surfaces, light))
     zero = jax.tree.map(jnp.zeros_like, swept)
     suns = [_from_sun(scene, surfaces, layout, light, materials, prepared) for light in scene.lights if isinstance(light, Sun)]
-    return Direct(sun=sum(suns, start=zero), rest=swept)
+    return Direct(sun=sum(suns, start=zero), rest=swept, brightest=brightest(scene, None if sky is None else sky.radiance))
+
+
+def brightest(scene: Scene, sky: Array | None) -> Float[Array, ""]:
+    """The largest of the radiances of the sky and of the irradiances of suns."""
+    sent = [light.irradiance for light in scene.lights if isinstance(light, Sun)] + ([] if sky is None else [sky])
+    return jnp.stack([jnp.zeros(()), *(jnp.max(jnp.asarray(value, float)) for value in sent)]).max()
 
 
 def _swept(transport: Transport, leaving: Light, sky: Inflow | None) -> Light:
@@ -163,14 +171,14 @@ class EmitterPoints(eqx.Module):
         return np.array(nearest) < (_NEAR * self.width) ** 2
 
 
-def small_emitters(scene: Scene, surfaces: Surfaces) -> EmitterPoints | None:
-    """Points on the emitting surfaces, if these are a small part of all surfaces; else None."""
+def small_emitters(scene: Scene, surfaces: Surfaces, count: int = _EMITTER_POINTS) -> EmitterPoints | None:
+    """`count` points or more on the emitting surfaces, if these are a small part of all surfaces; else None."""
     owners = [*scene.solids, *scene.boundary.sides]
     emits = np.array([checks.may_differ_from_zero(getattr(o, "emission", 0.0)) for o in owners], bool)
     emitters = np.nonzero(emits[surfaces.material])[0] if len(surfaces) else []
     if not len(emitters) or surfaces.area[emitters].sum() > _SMALL * surfaces.area.sum():
         return None
-    side = int(np.ceil(np.sqrt(_EMITTER_POINTS / len(emitters))))
+    side = int(np.ceil(np.sqrt(count / len(emitters))))
     spacing = scene.lattice.spacing
     patch, weight = patch_points(surfaces.normal[emitters], surfaces.offset[emitters], side)
     center = scene.lattice.lower + (surfaces.voxel[emitters] + 0.5) * spacing

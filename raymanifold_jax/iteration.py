@@ -38,7 +38,7 @@ _ENOUGH = 0.5  # w - K w of at least this ends the search for w
 _SEARCH = 24  # sweeps of it at most
 _STALLED = 24  # sweeps without a new smallest residual before giving up
 _GROWN = 1e3  # times the first residual: diverged
-_HOPED = 0.05  # what polishing is at first taken to make of a bound
+_HOPED = 0.2  # what polishing is at first taken to make of a bound: rather late than twice
 _ROUNDING = 2.0  # units in the last place by which a sweep's result may be off, of the largest radiance
 
 
@@ -229,10 +229,15 @@ class Iteration:
 
     @property
     def rounding(self) -> float:
-        """What the float type's rounding in the sweeps may add to the error, by the same bound."""
-        eps = float(jnp.finfo(self.residual.elements.dtype).eps)
-        largest = self.target / self._rtol
-        return _ROUNDING * eps * (1 + self.certificate.factor) * largest if largest > 0 else 0.0
+        """What the float type's rounding in the sweeps may add to the error, by the same bound.
+
+        Light that a medium takes up before it arrives anywhere counts: what is left of it is as exact as it was bright. So
+        does what is too faint for the type.
+        """
+        limits = jnp.finfo(self.residual.elements.dtype)
+        largest = max(self.target / self._rtol, float(self.system.direct.brightest))
+        faint = float(limits.tiny) if largest > 0 else 0.0
+        return _ROUNDING * (float(limits.eps) * largest + faint) * (1 + self.certificate.factor)
 
     @property
     def converged(self) -> bool:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from contextlib import nullcontext
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -38,7 +39,9 @@ from .transport.sharded import laps_over, mark_over, plane_size, slopes_over
 from .transport.slopes import THIN
 
 _MOST_LAPS = 1 << 16
-_ROUNDS = 1  # of Sinkhorn's iteration; each halves what bias is left, or better, and costs about four sweeps
+#: Rounds of Sinkhorn's iteration, over-relaxed. A round leaves 0 to .28 of what was off; with Chebyshev's factors for that, two
+#: leave .014. Each costs about three sweeps.
+_ROUNDS = (1.31, 1.04)
 _TRACE = 1e-7  # optical depth a voxel
 
 
@@ -189,18 +192,19 @@ def _balance(transport: Transport, area: Float[Array, " E"]) -> Transport:
         volume = transport.coverage * (4 * jnp.pi / weight * layout.spacing**3 / images)
         power = Light(power.elements, layout.from_padded(extinction) / images * volume)
         sums = Light(sums.elements, transport.voxel_sums)
-    factors = Light(jnp.ones_like(power.elements))
-    for _ in range(_ROUNDS):
+    factors = jax.tree.map(jnp.ones_like, power)
+    for beyond in _ROUNDS:
         sent = _transposed(transport, jax.tree.map(_ratio, power, sums))
-        factors = jax.tree.map(_factor, power, sent)
+        factors = jax.tree.map(partial(_factor, beyond), factors, power, sent)
         swept = _furnace(transport, factors)
         sums = Light(swept.elements, None if power.voxels is None else swept.voxels)
     return dataclasses.replace(transport, element_sums=swept.elements, voxel_sums=swept.voxels, factors=factors)
 
 
 @jax.jit
-def _factor(wanted: Array, sent: Array) -> Array:
-    return jnp.clip(jnp.where(sent > 0, wanted / jnp.where(sent > 0, sent, 1.0), 1.0), 0.5, 2.0)
+def _factor(beyond: float, factor: Array, wanted: Array, sent: Array) -> Array:
+    better = jnp.clip(jnp.where(sent > 0, wanted / jnp.where(sent > 0, sent, 1.0), 1.0), 0.5, 2.0)
+    return factor * (better / factor) ** beyond
 
 
 def _transposed(transport: Transport, asked: Light, albedo=None) -> Light:

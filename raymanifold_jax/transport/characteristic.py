@@ -169,6 +169,15 @@ class _Track(NamedTuple):
         through = lambda cut: lambda: _cross(rays, chords, plane, length, entering, self, fluence, cut)
         return lax.cond(self.occupied[number], through(True), through(False))
 
+    def uncross(self, number: Int[Array, ""], chords: Chords, length, entering, like: tuple, asked: tuple):
+        """The transpose of `cross` in the rays, what is `sent` and the light that enters: `like` these three.
+
+        `asked` are weights of what `cross` gives. `entering(light)` is linear.
+        """
+        plane = _row(self.fields, number)
+        through = lambda cut: lambda: _uncross(chords, plane, length, entering, self, cut, like, asked)
+        return lax.cond(self.occupied[number], through(True), through(False))
+
     def lap(self, own: Ordinates, first: Int[Array, ""] | int, rays: Float[Array, "D C P"], entering) -> Float[Array, "D C P"]:
         """Carry rays once around a periodic axis; `entering(plane)` is what its open ghost voxels send in."""
         table = self.table(own, first)
@@ -476,29 +485,55 @@ def _cross(rays, chords: Chords, fields: _Fields, length, entering, track: _Trac
     Without `cut` the plane holds no surface but the ghost voxels at its rim.
     """
     starts, passing = [], None
-    emitted = fields.exitance if entering is None else fields.exitance + entering
     plane = _facing(fields, chords) if cut else None
     for number in range(3):
         if number:
             # The barrier keeps XLA from computing the segment again for each reader of the moved rays.
             rays = shift(lax.optimization_barrier(rays), chords.offsets[number - 1], track.width, track.wrap_v, track.ring)
         starts.append(rays)
-        share = chords.share[number][:, None, None]
-        if plane is not None:
-            free = _free_part(plane, chords.ends[number][0], share)
-            rays, path = jnp.where(free.behind, emitted, rays), free.share
-        else:
-            free, path = None, share
-        start = 0.0 if free is None else jnp.where(free.behind, share - path, 0.0)
-        source = _source(fields, chords, number, start, path)
-        end, mean = _attenuate(rays, fields, source, length[:, None, None] * path)
-        rays = jnp.where(track.rim if free is None else free.arrives, emitted, end)
-        if fluence:
-            if source is not None and source.rise is not None and fields.source is not None:
-                # The paths' middles are not all at the voxel's: what they are off counts as in linear light.
-                mean = mean - (source.middle - fields.source)
-            passing = path * mean if passing is None else passing + path * mean
+        rays, passed = _segment(number, rays, chords, fields, plane, length, entering, track, fluence)
+        passing = passed if passing is None or passed is None else passing + passed
     return starts, rays, passing
+
+
+def _uncross(chords: Chords, fields: _Fields, length, entering, track: _Track, cut: bool, like: tuple, asked: tuple):
+    """The transpose of `_cross`, segment by segment: JAX's own, of the shifts, would be several times slower."""
+    to_starts, rays, passing = asked
+    plane, total = _facing(fields, chords) if cut else None, None
+    # What is sent, of each direction for itself: summed as a product with ones, which XLA does vectorise.
+    number_of = len(rays)
+    like = like[0], jax.tree.map(lambda a: jax.ShapeDtypeStruct((number_of, *a.shape), a.dtype), like[1]), like[2]
+    for number in (2, 1, 0):
+
+        def segment(rays, sent, light, number=number):
+            sending, lit = fields.sending(sent), plane and plane._replace(fields=fields.sending(sent))
+            return _segment(number, rays, chords, sending, lit, length, entering(light), track, passing is not None)
+
+        rays, *back = jax.linear_transpose(segment, *like)((rays, passing))
+        total = back if total is None else jax.tree.map(jnp.add, total, back)
+        rays = rays + to_starts[number]
+        if number:
+            rays = shift(lax.optimization_barrier(rays), -chords.offsets[number - 1], track.width, track.wrap_v)
+    sent, light = total or ((), None)
+    return rays, jax.tree.map(lambda a: jnp.tensordot(jnp.ones(number_of, a.dtype), a, 1), sent), light
+
+
+def _segment(number: int, rays, chords: Chords, fields: _Fields, plane: _Plane | None, length, entering, track, fluence: bool):
+    """Carry rays through their segment `number` in a plane; also, with `fluence`, their path means there."""
+    emitted = fields.exitance if entering is None else fields.exitance + entering
+    share = chords.share[number][:, None, None]
+    if plane is not None:
+        free = _free_part(plane, chords.ends[number][0], share)
+        rays, path = jnp.where(free.behind, emitted, rays), free.share
+    else:
+        free, path = None, share
+    start = 0.0 if free is None else jnp.where(free.behind, share - path, 0.0)
+    source = _source(fields, chords, number, start, path)
+    end, mean = _attenuate(rays, fields, source, length[:, None, None] * path)
+    if fluence and source is not None and source.rise is not None and fields.source is not None:
+        # The paths' middles are not all at the voxel's: what they are off counts as in linear light.
+        mean = mean - (source.middle - fields.source)
+    return jnp.where(track.rim if free is None else free.arrives, emitted, end), path * mean if fluence else None
 
 
 def _entering(image: Int[Array, " P"], radiance: Float[Array, "images D C"]) -> Float[Array, "D C P"]:
@@ -526,8 +561,10 @@ def _read_tile(tile, reads: Reads, bits, own: Ordinates, chords: Chords, plane: 
     voxels = plane.cells(cell)
 
     def value(radiance, sent):
-        mean = mean_of(radiance, voxels.sending(sent), face, chords, length[:, None, None])
-        return jnp.sum(weight[:, None] * mean, axis=0)
+        # Gathered once, not anew for every use; and summed as a product with ones: XLA vectorises neither otherwise.
+        radiance, here = lax.optimization_barrier((radiance, voxels.sending(sent)))
+        mean = mean_of(radiance, here, face, chords, length[:, None, None])
+        return jnp.tensordot(jnp.ones_like(own.weight), weight[:, None] * mean, 1)
 
     return _TileRead(cell, value)
 
@@ -572,8 +609,6 @@ def _mean_of_paths(radiance, plane: _Fields, face, chords: Chords, length) -> Fl
     towards = -_height((0.0, *face[1:4]), chords.step)
     # A step is as long as the rays' slant makes it.
     spacing = length / jnp.sqrt(sum(x**2 for x in chords.step))[:, None, None]
-    # Gathered once, not anew for every use.
-    radiance, plane = lax.optimization_barrier((radiance, plane))
     facing = _facing(plane, chords)
     for number, ends in enumerate(chords.ends):
         share = chords.share[number][:, None, None]

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..direct import Direct, _from_point, _from_sun, sky_radiance
+from ..direct import Direct, _from_point, _from_sun, brightest, sky_radiance
 from ..iteration import System
 from ..layout import make_layout
 from ..operator import Light, materials
@@ -150,7 +150,7 @@ def make_cube_system(scene: Scene, surfaces: Surfaces, scheme: LightRayCube) -> 
     has_sky = any(isinstance(light, Sky) for light in scene.lights)
     sky = sky_radiance(scene, quadrature.directions) if has_sky else None
     suns, suns_leaving = _suns(scene, surfaces, nodes)
-    direct = Direct(suns, _rest(scene, nodes, transport, stuff, sky))
+    direct = Direct(suns, _rest(scene, nodes, transport, stuff, sky), brightest(scene, sky))
     system = System(transport, stuff, direct)  # pyright: ignore[reportArgumentType]
     return CubeSystem(system, nodes, surfaces, quadrature, _columns(scene, surfaces, nodes, m), sky, suns_leaving)
 

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -205,7 +206,10 @@ def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, w
                 starts, rays, passing = track.cross(number, rays, chords, length, entering(number, light), with_passing, sent)
                 return tuple(starts), rays, passing
 
-            (starts, _, _), back = jax.vjp(step, rays, sent_row(number), light_at(number))
+            at = rays, sent_row(number), light_at(number)
+            if not whole:  # linear: nothing of the way forwards is needed, nor kept
+                return (), lambda asked: track.uncross(number, chords, length, partial(entering, number), at, asked)
+            (starts, _, _), back = jax.vjp(step, *at)
             return starts, back
 
         def keep(totals, number, sent, light):
