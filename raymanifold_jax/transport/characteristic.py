@@ -513,7 +513,7 @@ def _uncross(chords: Chords, fields: _Fields, length, entering, track: _Track, c
         total = back if total is None else jax.tree.map(jnp.add, total, back)
         rays = rays + to_starts[number]
         if number:
-            rays = shift(lax.optimization_barrier(rays), -chords.offsets[number - 1], track.width, track.wrap_v)
+            rays = shift(lax.optimization_barrier(rays), -chords.offsets[number - 1], track.width, track.wrap_v, track.ring)
     sent, light = total or ((), None)
     return rays, jax.tree.map(lambda a: jnp.tensordot(jnp.ones(number_of, a.dtype), a, 1), sent), light
 
