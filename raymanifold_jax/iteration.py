@@ -235,7 +235,7 @@ class Iteration:
         does what is too faint for the type.
         """
         limits = jnp.finfo(self.residual.elements.dtype)
-        largest = max(self.target / self._rtol, float(self.system.direct.brightest))
+        largest = max(self.target / self._rtol, float(jax.lax.stop_gradient(self.system.direct.brightest)))
         faint = float(limits.tiny) if largest > 0 else 0.0
         return _ROUNDING * (float(limits.eps) * largest + faint) * (1 + self.certificate.factor)
 
