@@ -45,7 +45,8 @@ def evolved_back(
 ) -> tuple[Float[Array, "C X Y Z"], Float[Array, "C X Y Z"] | None]:
     """The transpose in exitance and source (None without a medium), padded, from weights of the sums."""
     how = _Evolution(lattice, scheme, asked[1] is not None)
-    moving = lambda exitance, source: how.taped(dataclasses.replace(fields, exitance=exitance, source=source), faces, None, None)
+    put = lambda exitance, source: dataclasses.replace(fields, exitance=exitance, source=source)
+    moving = lambda exitance, source: how.taped(put(exitance, source), faces, None, None)
     return jax.vjp(moving, fields.exitance, fields.source)[1](asked)
 
 
