@@ -43,7 +43,7 @@ def test_fit_room(monkeypatch):
 
 @pytest.mark.slow
 def test_fit_fog(monkeypatch):
-    # Eight evaluations from two views: thin fog is found (0.8 % measured), thick fog better than the even start (36 %: 16, 6 %).
+    # Eight evaluations, two views: thin fog is found (0.8 % measured), thick fog better than the even start (36 %: 16, 6 %).
     names = run("fit_fog.ipynb", monkeypatch)
     error = {depth: float(np.sqrt(np.mean(e**2))) for depth, e in names["error"].items()}
     assert error[1.0] < 0.02

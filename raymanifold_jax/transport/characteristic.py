@@ -505,9 +505,7 @@ def _uncross(chords: Chords, fields: _Fields, length, entering, track: _Track, c
     return rays, jax.tree.map(lambda a: jnp.tensordot(jnp.ones(number_of, a.dtype), a, 1), sent), light
 
 
-def _segment(
-    number: int, rays, chords: Chords, fields: _Fields, plane: _Plane | None, length, entering, track: _Track, fluence
-):
+def _segment(number: int, rays, chords: Chords, fields: _Fields, plane: _Plane | None, length, entering, track: _Track, fluence):
     """Carry rays through their segment `number` in a plane; also, with `fluence`, their path means there."""
     emitted = fields.exitance if entering is None else fields.exitance + entering
     share = chords.share[number][:, None, None]
