@@ -14,6 +14,7 @@ _QUESTIONS = {
     "error-vs-time": "Which size, how many directions and which quadrature give the smallest error in a given time?",
     "stability": "Does a solve stay finite, non-negative and within its bound where numbers are extreme?",
     "convergence": "How many sweeps to a certified error of 1e-4, over albedos and optical depths?",
+    "gradient": "What do an image loss and its gradient cost, beside the solve alone?",
     "peer": "How long do we take for an error of 1 %, and how long does a path tracer on the same cores?",
 }
 
@@ -240,6 +241,24 @@ def convergence(quick: bool, size: int, directions: int, jacobi: int, out: Path 
         click.echo(f"wrote {out}", err=True)
     _print_environment(environment())
     click.echo(convergence_table(rows))
+
+
+@main.command()
+@click.option("--size", type=_at_least(4), default=32, show_default=True, help="Voxels along a side.")
+@click.option("--directions", type=_at_least(9), default=200, show_default=True)
+@click.option("--cells", type=_at_least(1), default=16, show_default=True, help="Of the floor's texture, along a side.")
+@click.option("--pixels", type=_at_least(1), default=64, show_default=True, help="Of the picture, along a side.")
+@click.option("--repeats", type=_at_least(1), default=3, show_default=True, help="Timed runs after the first.")
+@_json
+def gradient(size: int, directions: int, cells: int, pixels: int, repeats: int, json_file: Path | None) -> None:
+    """Time and peak memory of a solve, of an image loss, and of the loss with its gradient."""
+    from .gradient import gradient_table, measure
+    from .record import environment, write
+
+    records = measure(size, directions, cells, pixels, repeats, _tell)
+    write(json_file, _QUESTIONS["gradient"], records, environment=environment())
+    _print_environment(environment())
+    click.echo(gradient_table(records))
 
 
 def _check_quadrature(name: str) -> None:

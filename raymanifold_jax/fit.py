@@ -53,11 +53,15 @@ class Parameter(eqx.Module):
     - `where`: a name such as `"solids[0].albedo"`, `"boundary.z[0].albedo"`, `"medium.scattering"`, `"lights[1].irradiance"`,
       or a function from the scene to one of its arrays, as for `equinox.tree_at`. Of a `Texture` it is the values.
     - `lower`, `upper`: bounds; [0, 1] for an albedo and [0, inf) for all else if left out.
+    - `start` and `expand`, together: fit values of another shape, that expand(values), a function of JAX, makes the scene's
+      array of: a fog on a coarser lattice, one albedo for many walls. They begin at `start`, and bounds hold for them.
     """
 
     where: str | Callable[[Scene], Any] = eqx.field(static=True)
     lower: float | None = eqx.field(static=True, default=None)
     upper: float | None = eqx.field(static=True, default=None)
+    start: Any = None
+    expand: Callable[[Array], Array] | None = eqx.field(static=True, default=None)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -164,7 +168,7 @@ class _Chosen:
         self.names = [p.where if isinstance(p.where, str) else f"parameters[{i}]" for i, p in enumerate(self.parameters)]
         found = [_look_up(scene, name, p.where) for name, p in zip(self.names, self.parameters, strict=True)]
         self.where = [where for where, _ in found]
-        self.start = [np.asarray(value, float) for _, value in found]
+        self.start = [_start(name, p, value) for name, p, (_, value) in zip(self.names, self.parameters, found, strict=True)]
         self.size = sum(value.size for value in self.start)
         ends = np.cumsum([value.size for value in self.start])
         self.slices = [slice(end - value.size, end) for end, value in zip(ends, self.start, strict=True)]
@@ -193,9 +197,21 @@ class _Chosen:
     def put(self, vector: Array) -> Scene:
         """The scene with these values."""
         scene = self.scene
-        for where, value in zip(self.where, self.split(vector), strict=True):
-            scene = eqx.tree_at(where, scene, value)
+        for where, value, parameter in zip(self.where, self.split(vector), self.parameters, strict=True):
+            scene = eqx.tree_at(where, scene, value if parameter.expand is None else parameter.expand(value))
         return scene
+
+
+def _start(name: str, parameter: Parameter, value: Any) -> np.ndarray:
+    if (parameter.start is None) != (parameter.expand is None):
+        checks.fail(name, "one of start and expand", "both or neither", "say where the values to expand begin")
+    if parameter.expand is None:
+        return np.asarray(value, float)
+    start = np.asarray(checks.finite("start", parameter.start), float)
+    found, expected = jax.eval_shape(parameter.expand, jnp.asarray(start)).shape, jnp.shape(value)
+    if found != expected:
+        checks.fail("expand", f"an array of shape {found}", f"{expected}, as {name} in the scene", "repeat values to fill it")
+    return start
 
 
 def _look_up(scene: Scene, name: str, where: Any) -> tuple[Callable, Any]:

@@ -180,8 +180,6 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
         expected = "shapes and directions of lights that JAX does not trace"
         advice = "close over the scene, and put parameters in with equinox.tree_at: what is in front of what has no derivative"
         checks.fail("scene", "traced geometry", expected, advice, TypeError)
-    if isinstance(scheme, LightRayCube) and checks.is_traced(scene):
-        checks.fail("scheme", f"{scheme} with traced values", "rm.Characteristic()", "only its sweeps have derivatives")
     if not (isinstance(solver, Jacobi | Krylov | Anderson | OptimistixFixedPoint) or solver == "auto"):
         kinds = 'rm.Krylov(), rm.Anderson(), rm.OptimistixFixedPoint(...), rm.Jacobi() or "auto"'
         checks.fail("solver", repr(solver), kinds, 'leave it at "auto"')

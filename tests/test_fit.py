@@ -111,6 +111,8 @@ def test_floor_of_the_ring_scene_from_four_views(noise):
         ({"parameters": "boundary..x"}, "expected a name of a value"),
         ({"parameters": []}, "parameters: got none"),
         ({"parameters": rm.Parameter(NAMES[1], lower=0.6)}, "expected a start within the bounds"),
+        ({"parameters": rm.Parameter(NAMES[1], start=[0.5])}, "got one of start and expand"),
+        ({"parameters": rm.Parameter(NAMES[1], start=[0.5], expand=lambda v: v)}, r"expand: got an array of shape \(1,\)"),
         ({"targets": []}, "targets: got none"),
         ({"targets": [3]}, r"targets\[0\]: got 3"),
         ({"targets": rm.FluenceTarget([[0.5, 0.5, 0.5]], [[1.0, 2.0]])}, "expected no band axis, as the scene"),
@@ -157,3 +159,26 @@ def test_a_texture_of_equal_values_is_that_value():
     plain, textured = solved(box(0.5, 0.3)), solved(box(0.5, rm.Texture(np.full((3, 5), 0.3))))
     np.testing.assert_allclose(textured.surfaces.radiosity, plain.surfaces.radiosity, rtol=1e-5)
     np.testing.assert_allclose(rm.render(textured, TOP), rm.render(plain, TOP), rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_values_that_expand_to_the_scenes():
+    # One albedo for both walls along x, through a function: the same optimum as fitting the wall that stands on both sides.
+    truth = solved(box(0.7, 0.5))
+    lone = rm.Parameter(NAMES[1], start=[0.4], expand=lambda v: v[0])
+    found = rm.fit(box(), irradiances(truth), lone, QUADRATURE, rtol=1e-4, progress=False)
+    np.testing.assert_allclose(found.values[NAMES[1]], [0.7], rtol=2e-3)
+
+
+@pytest.mark.slow
+def test_a_fit_that_wants_to_leave_the_range_stays_in_it():
+    # Readings ten times too bright for any albedo: walls end at 1 or below, finite, with a reason and a large residual.
+    bright = irradiances(solved(box(0.9, 0.9)), factor=10.0)
+    for method in ("gauss-newton", "l-bfgs"):
+        found = rm.fit(box(), bright, NAMES, QUADRATURE, method=method, max_evaluations=8, progress=False)
+        values = np.array([found.values[name] for name in NAMES])
+        assert np.isfinite(values).all()
+        assert ((values >= 0) & (values <= 1)).all()
+        assert np.isfinite(found.history).all()
+        assert found.reason
+        assert found.history[-1] > 0.5 * float(np.sqrt(np.mean(bright.values**2)))

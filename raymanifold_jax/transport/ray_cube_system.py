@@ -20,8 +20,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int
 
+from .. import checks
 from ..direct import Direct, _from_point, _from_sun, brightest, sky_radiance
 from ..iteration import System
 from ..layout import make_layout
@@ -29,7 +31,8 @@ from ..operator import Light, materials
 from ..quadrature import Quadrature, light_ray_cube
 from ..scene import MIRROR, OPEN, PointLight, Scene, Sky, Sun
 from ..surfaces import Surfaces
-from .light_ray_cube import LightRayCube, NodeFields, coordinate_evolution, count_laps, local_transformation
+from .light_ray_cube import LightRayCube, NodeFields, count_laps, local_transformation
+from .ray_cube_derivative import evolved, evolved_back
 from .ray_layout import Faces, RayLattice, make_faces
 from .ray_nodes import RayNodes, find_nodes
 
@@ -52,7 +55,7 @@ class CubeTransport(eqx.Module):
         Light that is `scattered` is the same all over a voxel, as all light in the paper.
         """
         fields = self._with_light(leaving)
-        arriving, seen = coordinate_evolution(self.lattice, fields, self.faces, self.scheme, sky, None, fluence)
+        arriving, seen = evolved(self.lattice, self.scheme, fields, self.faces, sky, None, fluence)
         return Light(arriving.reshape(len(arriving), -1)[:, self.cell], seen)
 
     @eqx.filter_jit
@@ -61,7 +64,18 @@ class CubeTransport(eqx.Module):
     ) -> Float[Array, "C nx ny nz"]:
         """Mean radiance that goes out against the directions `inward`, at the nodes that have one."""
         fields, gather = self._with_light(leaving), self.lattice.to_padded(inward)
-        return coordinate_evolution(self.lattice, fields, self.faces, self.scheme, sky, gather, False)[0]
+        return evolved(self.lattice, self.scheme, fields, self.faces, sky, gather, False)[0]
+
+    @eqx.filter_jit
+    def transposed(self, asked: Light, scattered: bool = False) -> Light:
+        """The transpose in what leaves: weights of arriving light back to weights of what was sent."""
+        bands, count = asked.elements.shape[0], int(np.prod(self.lattice.shape))
+        at_nodes = jnp.zeros((bands, count), asked.elements.dtype).at[:, self.cell].set(asked.elements)
+        fields = self._with_light(jax.tree.map(jnp.zeros_like, asked))
+        weights = at_nodes.reshape(bands, *self.lattice.shape), asked.voxels
+        exitance, source = evolved_back(self.lattice, self.scheme, fields, self.faces, weights)
+        exitance = self.lattice.from_padded(exitance).reshape(bands, -1)[:, self.cell]
+        return Light(exitance, None if source is None else self.lattice.from_padded(source))
 
     def _with_light(self, leaving: Light) -> NodeFields:
         bands = leaving.elements.shape[0]
@@ -134,7 +148,9 @@ def make_cube_system(scene: Scene, surfaces: Surfaces, scheme: LightRayCube) -> 
     nodes = find_nodes(scene, m)
     stuff = materials(scene, nodes.table)
     if stuff.extinction is not None:
-        _check_depth(scheme, float(stuff.extinction.max()), scene.lattice.spacing)
+        deepest = lax.stop_gradient(stuff.extinction.max())
+        if not checks.is_traced(deepest):  # else jit or vmap keeps it
+            _check_depth(scheme, float(deepest), scene.lattice.spacing)
     periodic = scene.boundary.periodic
     padded = [n if wraps else n + m for n, wraps in zip(scene.lattice.shape, periodic, strict=True)]
     opened = tuple(kind is OPEN for kind in scene.boundary.sides)
@@ -179,13 +195,14 @@ def _with_laps(lattice: RayLattice, fields: NodeFields, faces: Faces, scheme: Li
         return faces
     dark = jnp.zeros((bands, *lattice.padded), fields.normal.dtype)
     source = None if fields.extinction is None else dark
-    lit = dataclasses.replace(fields, exitance=dark, source=source)
+    extinction = None if fields.extinction is None else lax.stop_gradient(fields.extinction)
+    lit = dataclasses.replace(fields, exitance=dark, extinction=extinction, source=source)
     return eqx.filter_jit(count_laps)(lattice, lit, faces, scheme)
 
 
 def _rest(scene: Scene, nodes: RayNodes, transport: CubeTransport, stuff, sky) -> Light:
     """First-flight light of skies, emitting surfaces and media, and point lights."""
-    emits = any(bool(jnp.any(a)) for a in jax.tree.leaves((stuff.emission, stuff.medium_source)))
+    emits = checks.may_differ_from_zero((stuff.emission, stuff.medium_source))
     if sky is None and not emits:
         rest = Light(jnp.zeros_like(stuff.emission), jnp.zeros((scene.bands, *scene.lattice.shape), stuff.emission.dtype))
     else:
