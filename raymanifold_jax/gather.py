@@ -38,7 +38,7 @@ _OFF = 2e-3  # voxels: how far off a surface rays start
 _DEEP = 0.5  # voxels: how far inside a solid a point on its surface may be by mistake
 _POINTS = 256  # points of a final gather at once, with _RAYS rays each
 _RAYS = 1024
-_SPREAD = 0.003  # of the mean: a standard error above this asks for four times as many rays
+_SPREAD = 0.0015  # of the mean: a standard error above this asks for four times as many rays
 _REFINEMENTS = 2
 _BLOCKS = 5  # of a volume source, along each axis, for one of the solve's
 
@@ -76,7 +76,7 @@ def irradiance(solution: Solution, points: Any, normals: Any, directions: int | 
 
     The mean of the radiance over `directions` directions spread over the hemisphere around each normal, and the light
     of suns, point lights, small emitting surfaces and compact volume sources exactly. By default 1024 directions, and up to
-    16384 at points where quarters of them disagree by more than 0.3 %. The normals may have any length but 0. Points up to
+    16384 at points where quarters of them disagree by more than 0.15 %. The normals may have any length but 0. Points up to
     half a voxel inside a solid or outside the lattice are taken to be on the surface.
 
     **Raises** `TypeError` for anything but a solution, `ValueError` for NaN, another shape, a normal of length 0, or points
@@ -94,7 +94,7 @@ def fluence(solution: Solution, points: Any, directions: int | None = None) -> F
 
     4 pi times the mean of the radiance over `directions` directions, and the light of suns, point lights, small emitting
     surfaces and compact volume sources exactly. By default 2048 directions, and up to 32768 where quarters of them disagree
-    by more than 0.3 %. With `directions=0` it is interpolated between the voxels instead: quick, for many points.
+    by more than 0.15 %. With `directions=0` it is interpolated between the voxels instead: quick, for many points.
 
     **Raises** `TypeError` for anything but a solution, `ValueError` for NaN, another shape, or points outside the lattice or
     inside a solid.
