@@ -7,13 +7,15 @@ from pathlib import Path
 import jax
 import pytest
 
+DEVICES = os.environ.get("RAYMANIFOLD_TEST_DEVICES")  # virtual ones, for tests of meshes; they make all else slower
+collect_ignore = [] if DEVICES else ["test_sharding.py"]
 _MAPS = Path("/proc/self/maps")
 _MANY = 15_000  # of the 65 530 regions of memory that Linux grants a process
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    # Virtual devices for tests of meshes; all else runs on the first.
-    jax.config.update("jax_num_cpu_devices", 8)
+    if DEVICES:
+        jax.config.update("jax_num_cpu_devices", int(DEVICES))
     # Environment variables, because pytest-xdist's workers and the command line's subprocesses inherit them. The cache
     # lies in pytest's own (`pytest --cache-clear` empties it) and outlives the run.
     cache = getattr(config, "cache", None)  # none with `-p no:cacheprovider`

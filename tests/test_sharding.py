@@ -2,7 +2,7 @@
 
 Sums over directions and elements are added up in another order there, and nothing else: results agree to a few units in the
 last place of float64 (1e-12 of the largest value; what a wrong neighbour or a lost ray costs is 1e-3 or more).
-`tests/conftest.py` makes 8 virtual devices.
+`test_meshes_of_devices.py` runs these tests on 8 virtual devices; RAYMANIFOLD_TEST_DEVICES=8 does so for pytest itself.
 """
 
 import os
