@@ -13,6 +13,7 @@ def brackets(estimate: rm.ErrorEstimate, exact: np.ndarray, at_most: float) -> N
     assert true <= estimate.rms <= at_most * true, (true, str(estimate))
 
 
+@pytest.mark.slow
 def test_room_with_its_ceiling_alight():
     # Scene A of the rendered references at 16^3; their own error is 0.1 %.
     rows = problems.probes("A")["probes"][::4]
@@ -31,7 +32,6 @@ def test_fog():
     brackets(estimate, 4 * np.pi * np.array([row["mean_radiance"] for row in rows]), 20)
 
 
-@pytest.mark.slow
 def test_furnace_has_no_error_but_the_iterations():
     problem = problems.furnace("box", 0.5)
     estimate = rm.estimate_error(problem.scene, quadrature=rm.quadrature.fibonacci(40), rtol=1e-5)

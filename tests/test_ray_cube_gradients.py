@@ -29,9 +29,9 @@ def random_scene(seed, fog, side):
 @pytest.mark.parametrize(
     ("fog", "side", "scheme"),
     [
-        (False, "wall", rm.LightRayCube(1)),
+        pytest.param(False, "wall", rm.LightRayCube(1), marks=pytest.mark.slow),
         (True, "wall", rm.LightRayCube(2, "exponential", "ends")),
-        (True, "periodic", rm.LightRayCube(1)),
+        pytest.param(True, "periodic", rm.LightRayCube(1), marks=pytest.mark.slow),
     ],
 )
 def test_transposed_evolution(fog, side, scheme, x64):

@@ -234,6 +234,7 @@ def test_mirror_is_half_of_the_doubled_scene():
     np.testing.assert_allclose(single.fluence, doubled.fluence[4:], rtol=2e-5)
 
 
+@pytest.mark.slow
 def test_bands_are_separate_solves():
     # An RGB scene is three grey ones, to float32 rounding (1e-6 a sweep): the bands share geometry and the stopping rule only.
     albedo, scattering, sky = np.array([[0.2, 0.5, 0.8], [0.5, 2.0, 1.0], [1.0, 0.3, 2.0]])

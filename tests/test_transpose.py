@@ -117,7 +117,8 @@ def test_what_is_sent_arrives(medium):
             np.testing.assert_allclose(arriving.elements, 1, rtol=1e-5)
 
 
-@pytest.mark.parametrize("side", [rm.PERIODIC, pytest.param(rm.MIRROR, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("side", [rm.PERIODIC, rm.MIRROR])
+@pytest.mark.slow
 def test_white_sky_over_an_unbounded_white_fog(side):
     # Sky of radiance 1/pi above and below a layer without absorption: the radiance is 1/pi everywhere, the flux out is 1.
     scene = rm.Scene(
