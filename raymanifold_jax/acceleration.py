@@ -148,18 +148,18 @@ def _elimination(near: Diffusion) -> tuple[Array, Array]:
 
 def _above(near: Diffusion, voxels: Array) -> Array:
     """Values of voxels at the elements that hang on them."""
-    return voxels[:, *_where(near, voxels.shape)]
+    return voxels[:, *_where(near.probe, voxels.shape)]
 
 
 def _gathered(near: Diffusion, elements: Array) -> Array:
     """In each voxel the sum over the elements that hang on it."""
     shape = near.levels[0].loss.shape
-    return jnp.zeros(shape, elements.dtype).at[:, *_where(near, shape)].add(elements)
+    return jnp.zeros(shape, elements.dtype).at[:, *_where(near.probe, shape)].add(elements)
 
 
-def _where(near: Diffusion, shape: tuple[int, ...]) -> tuple[Array, ...]:
+def _where(probe: Int[Array, " E"], shape: tuple[int, ...]) -> tuple[Array, ...]:
     # By three indices: on a mesh, flat fields would have to be gathered from their blocks.
-    return jnp.unravel_index(near.probe, shape[1:])
+    return jnp.unravel_index(probe, shape[1:])
 
 
 def _conjugate_gradients(levels: tuple[_Level, ...], right: Array) -> Array:
@@ -289,21 +289,20 @@ def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodi
         links.append(4 * jnp.pi * open_part * (2 / (3 * (total + next_to(total))) + (1 - bend) / 4))
         bends.append(open_part * bend)
     of_elements = jnp.broadcast_to(jnp.pi * area, stuff.albedo.shape)
-    at_probe = lambda field: field.reshape(bands, -1)[:, probe]
-    deep, bend = at_probe(depth), at_probe(straight)
+    at_probe = _where(probe, depth.shape)
+    deep, bend = depth[:, *at_probe], straight[:, *at_probe]
     coupling = 2 * of_elements / (1 + jnp.minimum(deep, 1.0))
     beside = 2 / jnp.pi * of_elements * bend  # half as far as to the next voxel
     whole = of_elements * (1 - stuff.albedo) + coupling * stuff.albedo
     taken = coupling * of_elements * (1 - stuff.albedo) / whole
-    loss = (power * (1 - scattering)).reshape(bands, -1).at[:, probe].add(taken).reshape(depth.shape)
+    loss = (power * (1 - scattering)).at[:, *at_probe].add(taken)
     # Nothing happens in voxels inside solids; and a matrix that nearly is singular must not be.
     links_of = sum((link + jnp.roll(link, 1, axis) for axis, link in enumerate(links, start=1)), start=jnp.zeros_like(loss))
     loss = jnp.where(links_of + loss > 0, loss + 8 * jnp.finfo(real).eps * links_of, 1.0)
     second = None
     if sloped:
         kept = 16 * (1 / (3 * total) + (1 - straight) / 4)
-        held = kept.reshape(bands, -1).at[:, probe].add(beside).reshape(depth.shape)
-        second = _Second(_levels(bends, held), kept, beside)
+        second = _Second(_levels(bends, kept.at[:, *at_probe].add(beside)), kept, beside)
     voxels = None if stuff.scattering_albedo is None else power
     return Diffusion(
         _levels(links, loss), second, Light(of_elements, voxels), Light(stuff.albedo, stuff.scattering_albedo), probe, coupling,

@@ -10,6 +10,7 @@ Public: `Layout`, `make_layout`, `Ordinates`, `make_ordinates`.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -111,12 +112,58 @@ class Layout(eqx.Module):
         inner = tuple(slice(p, n - p) for p, n in zip(self.pad, self.padded, strict=True))
         return self.unfolding.fold(field[(slice(None), *inner)])
 
+    def planes(self, field: Float[Array, "*C X Y Z"], axis: int, _fill: float = 0) -> Float[Array, "K *C P"]:
+        """A padded field as flat planes along a sweep axis; blocks of a layout fill the places that hold no voxel."""
+        return flat_planes(field, axis)
+
+    def from_planes(self, planes: Float[Array, "K C P"], axis: int) -> Float[Array, "C X Y Z"]:
+        """The inverse of `planes`."""
+        field = jnp.moveaxis(planes, 1, 0).reshape(-1, *self.padded_along(axis))
+        return field.transpose(0, *(1 + AXES[axis].index(a) for a in range(3)))
+
+    def rim(self, axis: int) -> Bool[np.ndarray, " P"]:
+        """The ghost voxels at the rim of a plane, flat."""
+        inside = np.ones([self.padded[a] - 2 * self.pad[a] for a in AXES[axis][1:]], bool)
+        return ~np.pad(inside, [(self.pad[a], self.pad[a]) for a in AXES[axis][1:]]).ravel()
+
+    def ring(self, _axis: int) -> None:
+        """Planes are whole: there are no other blocks."""
+
+    def largest(self, values: Array) -> Array:
+        """Of all devices, of which there is one."""
+        return values
+
+    def neighbour(self, field: Array, axis: int, step: int) -> Array:
+        """Each voxel's neighbour in a padded field, axis 0 to 2; 0 beyond ends that are not joined."""
+        dim = field.ndim - 3 + axis
+        moved = jnp.roll(field, -step, dim)
+        if self.pad[axis] == 0:
+            return moved
+        end = jnp.arange(field.shape[dim]) == (field.shape[dim] - 1 if step > 0 else 0)
+        return jnp.where(end.reshape([-1 if d == dim else 1 for d in range(field.ndim)]), 0.0, moved)
+
     def exitance_field(self, exitance: Float[Array, "C E"]) -> Float[Array, "C X Y Z"]:
         """Each voxel's exitant radiance: the mean over its elements, by area."""
-        values = exitance[:, self.source_element] * self.share
-        size = int(np.prod(self.padded))
-        flat = jnp.zeros((exitance.shape[0], size), exitance.dtype).at[:, self.cell].add(values)
-        return flat.reshape(-1, *self.padded)
+        return exitance_in_voxels(exitance, self.source_element, self.share, self.cell, self.padded)
+
+
+def flat_planes(field: Float[Array, "*C X Y Z"], axis: int) -> Float[Array, "K *C P"]:
+    """A field as flat planes along a sweep axis."""
+    bands = field.ndim - 3
+    turned = field.transpose(bands + axis, *range(bands), *(bands + a for a in AXES[axis][1:]))
+    return turned.reshape(*turned.shape[:-2], -1)
+
+
+def exitance_in_voxels(
+    exitance: Float[Array, "C E"],
+    element: Int[Array, " I"],
+    share: Float[Array, " I"],
+    cell: Int[Array, " I"],
+    shape: tuple[int, int, int],
+) -> Float[Array, "C X Y Z"]:
+    """The sum, in each voxel, over the element images there: their exitance times their share."""
+    flat = jnp.zeros((exitance.shape[0], int(np.prod(shape))), exitance.dtype)
+    return flat.at[:, cell].add(exitance[:, element] * share).reshape(-1, *shape)
 
 
 def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
@@ -274,6 +321,10 @@ class Ordinates(eqx.Module):
     # Bit d of each hit or probe read, in words of 32: rays of direction d arrive at the element in its own voxel.
     hit_bits: UInt32[Array, "G words M"] | None = None
     probe_bits: UInt32[Array, "G words M2"] | None = None
+
+    def marked(self, hits: Array | None, probes: Array | None) -> Ordinates:
+        """The same directions with these bits."""
+        return dataclasses.replace(self, hit_bits=hits, probe_bits=probes)
 
 
 def make_ordinates(quadrature: Quadrature, bands: int, plane_size: int) -> tuple[Ordinates, ...]:

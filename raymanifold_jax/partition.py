@@ -32,7 +32,7 @@ from jax.sharding import PartitionSpec as Spec
 from jaxtyping import Array, Bool, Float, Int
 
 from .blocks import even, full, make_moves, positions, take, unfolded
-from .layout import AXES, AxisReads, Layout, Ordinates, Reads, Unfolding
+from .layout import AXES, AxisReads, Layout, Ordinates, Reads, Unfolding, exitance_in_voxels, flat_planes
 from .sharding import NAMES
 from .shift import Ring, neighbours
 
@@ -100,28 +100,16 @@ class Uncompared:
         return 0
 
 
-class Partition(eqx.Module):
-    """A `Layout` over a mesh; see the module's docstring."""
+class _InBlocks(eqx.Module):
+    """What a `Layout` says of itself that is the same of all blocks and of each."""
 
     shapes: Shapes
     fields: _Fields
     tables: _Tables
-    whole: Uncompared = eqx.field(static=True)  # the `Layout`, from which directions are prepared
 
     @property
     def unfolding(self) -> Unfolding:
         return self.shapes.unfolding
-
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """Of stored fields."""
-        x, y = (self.shapes.stored(axis).size for axis in (0, 1))
-        return x, y, self.shapes.scene_shape[2]
-
-    @property
-    def padded(self) -> tuple[int, int, int]:
-        x, y = (self.shapes.split(axis, NAMES[axis]).size for axis in (0, 1))
-        return x, y, self.shapes.lattice[2]
 
     @property
     def pad(self) -> tuple[int, int, int]:
@@ -142,6 +130,23 @@ class Partition(eqx.Module):
     @property
     def buried(self) -> Bool[Array, "X Y Z"]:
         return self.fields.buried[0]
+
+
+class Partition(_InBlocks):
+    """A `Layout` over a mesh; see the module's docstring."""
+
+    whole: Uncompared = eqx.field(static=True)  # the `Layout`, from which directions are prepared
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of stored fields."""
+        x, y = (self.shapes.stored(axis).size for axis in (0, 1))
+        return x, y, self.shapes.scene_shape[2]
+
+    @property
+    def padded(self) -> tuple[int, int, int]:
+        x, y = (self.shapes.split(axis, NAMES[axis]).size for axis in (0, 1))
+        return x, y, self.shapes.lattice[2]
 
     @property
     def largest_plane(self) -> int:
@@ -182,18 +187,13 @@ class Partition(eqx.Module):
                 assert mark is not None
                 # Rows that pad read with no weight, whatever their bits.
                 bits.append(put(mesh, np.moveaxis(np.asarray(mark)[:, :, np.maximum(rows.row, 0)], 2, 0), TABLE))
-            bare = eqx.tree_at(lambda o: (o.hit_bits, o.probe_bits), own, (None, None), is_leaf=lambda x: x is None)
-            bare = jax.tree.map(lambda a: put(mesh, a, SAME), bare)
-            found.append(eqx.tree_at(lambda o: (o.hit_bits, o.probe_bits), bare, tuple(bits), is_leaf=lambda x: x is None))
+            bare = jax.tree.map(lambda a: put(mesh, a, SAME), own.marked(None, None))
+            found.append(bare.marked(*bits))
         return tuple(found)
 
 
-class Block(eqx.Module):
+class Block(_InBlocks):
     """One device's part of a partition, within `shard_map`. Lengths and numbers are of this part."""
-
-    shapes: Shapes
-    fields: _Fields
-    tables: _Tables
 
     @property
     def padded(self) -> tuple[int, int, int]:
@@ -206,32 +206,8 @@ class Block(eqx.Module):
         return x, y, self.shapes.scene_shape[2]
 
     @property
-    def unfolding(self) -> Unfolding:
-        return self.shapes.unfolding
-
-    @property
-    def pad(self) -> tuple[int, int, int]:
-        return self.shapes.pad
-
-    @property
-    def spacing(self) -> float:
-        return self.shapes.spacing
-
-    @property
-    def elements(self) -> int:
-        return self.shapes.elements
-
-    @property
     def cubic(self) -> bool:
         return self.shapes.cubic
-
-    @property
-    def plane(self) -> Float[Array, "4 X Y Z"]:
-        return self.fields.plane
-
-    @property
-    def buried(self) -> Bool[Array, "X Y Z"]:
-        return self.fields.buried[0]
 
     @property
     def inflow_image(self) -> Int[Array, "X Y Z"]:
@@ -272,15 +248,11 @@ class Block(eqx.Module):
         return jax.linear_transpose(self.to_padded, like)(field)[0]
 
     def exitance_field(self, exitance: Float[Array, "C E"]) -> Float[Array, "C X Y Z"]:
-        values = exitance[:, self.source_element] * self.share
-        flat = jnp.zeros((exitance.shape[0], int(np.prod(self.padded))), exitance.dtype).at[:, self.cell].add(values)
-        return flat.reshape(-1, *self.padded)
+        return exitance_in_voxels(exitance, self.source_element, self.share, self.cell, self.padded)
 
     def planes(self, field: Array, axis: int, fill: float = 0) -> Array:
         """A padded field as flat planes along a sweep axis, [K, *C, P]; `fill` in the slots that hold no voxel."""
-        bands = field.ndim - 3
-        turned = self._turned(field, axis).transpose(bands + axis, *range(bands), *(bands + a for a in AXES[axis][1:]))
-        flat = turned.reshape(*turned.shape[:-2], -1)
+        flat = flat_planes(self._turned(field, axis), axis)
         return jnp.where(self._empty(axis), jnp.asarray(fill, flat.dtype), flat) if fill else flat
 
     def from_planes(self, planes: Float[Array, "K C P"], axis: int) -> Float[Array, "C X Y Z"]:

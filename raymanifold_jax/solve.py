@@ -240,14 +240,13 @@ def _finish(
         everywhere = system.transport(system.materials.reflected(system.source + bounced), fluence=True)
         bounced = Light(bounced.elements, everywhere.voxels)
     rest, sun = system.direct.rest + bounced, system.direct.sun
-    if nodes is None:
-        rest, sun = restored(system.transport.layout, (rest, sun))
     if nodes is not None:
         rest, sun, outside = *nodes.at_elements(rest, sun), jnp.asarray(~nodes.solid)
         free = jnp.where(outside, jnp.ones((), rest.elements.dtype), 0.0)
     else:
+        covered = system.transport.coverage / _whole(system.transport)
+        rest, sun, covered = restored(system.transport.layout, (rest, sun, covered))
         outside = jnp.asarray(~surfaces.solid)
-        covered = restored(system.transport.layout, system.transport.coverage / _whole(system.transport))
         free = jnp.where(outside, covered, 0.0)
     fluence = lambda light: jnp.where(outside, 4 * jnp.pi * light.voxels, 0.0)
     fields = {

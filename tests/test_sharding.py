@@ -21,13 +21,13 @@ from jax.sharding import AxisType
 import raymanifold_jax as rm
 from raymanifold_jax.blocks import even, full, make_moves, positions
 from raymanifold_jax.direct import sky_inflow
-from raymanifold_jax.layout import Layout, make_ordinates
+from raymanifold_jax.layout import Layout, flat_planes, make_ordinates
 from raymanifold_jax.operator import materials
 from raymanifold_jax.partition import FIELD, make_partition
 from raymanifold_jax.placement import known, restored, stored
 from raymanifold_jax.prepare import prepare
 from raymanifold_jax.shift import Ring, shift
-from raymanifold_jax.transport.characteristic import SweptMedium, _planes
+from raymanifold_jax.transport.characteristic import SweptMedium
 from raymanifold_jax.transport.sharded import adjoint_over, laps_over, mark_over, plane_size, slopes_over, sweep_over
 
 _EXACT = 1e-12
@@ -103,7 +103,7 @@ def test_planes_of_blocks_are_the_planes_of_the_lattice(kind, shape):
         planes, back = jax.jit(lambda f, turned=turned, out=out: partition.on_blocks(turned, (), f, (), out))(padded)
         rows, columns = (positions(partition.shapes.split(a, name)) for a, name in ((u, "u"), (v, "v")))
         picked = np.asarray(planes)[:, :, rows][:, :, :, columns]
-        np.testing.assert_array_equal(picked.reshape(*picked.shape[:2], -1), _planes(jnp.asarray(expected), axis))
+        np.testing.assert_array_equal(picked.reshape(*picked.shape[:2], -1), flat_planes(jnp.asarray(expected), axis))
         close(back, padded, 0.0)
 
 

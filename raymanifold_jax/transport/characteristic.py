@@ -97,11 +97,11 @@ def sweep(
         at_elements, in_voxels = sums
         fields, occupied, images = _on_axis(axis, lambda a: _fields(layout, a, surface, medium, inflow is not None))
         track = _track(layout, axis if isinstance(axis, int) else 0, fields, occupied)
-        strength = None if factor is None else _on_axis(axis, lambda a, field=factor: _planes_of(layout, field, a))
+        strength = None if factor is None else _on_axis(axis, lambda a, field=factor: layout.planes(field, a))
         hits, probes, passing = _sweep_axis(track, own, reads, images, inflow, strength, fluence)
         at_elements = at_elements.at[:, reads.hits.element].add(hits).at[:, reads.probes.element].add(probes)
         if passing is not None:
-            in_voxels = in_voxels + _on_axis(axis, lambda a: _from_planes(layout, a, passing))
+            in_voxels = in_voxels + _on_axis(axis, lambda a: layout.from_planes(passing, a))
         return at_elements, in_voxels
 
     sums = (
@@ -125,18 +125,6 @@ def _on_axis(axis: int | Array, function: Callable[[int], Any]) -> Any:
     if isinstance(axis, int):
         return function(axis)
     return lax.switch(axis, [lambda a=a: function(a) for a in range(3)])
-
-
-def _planes(field: Float[Array, "*C X Y Z"], axis: int) -> Float[Array, "K *C P"]:
-    """A field as flat planes along a sweep axis."""
-    bands = field.ndim - 3
-    turned = field.transpose(bands + axis, *range(bands), *(bands + a for a in AXES[axis][1:]))
-    return turned.reshape(*turned.shape[:-2], -1)
-
-
-def _planes_of(layout: Layout | Block, field: Array, axis: int, fill: float = 0) -> Array:
-    """The planes of a layout's field; `fill` where a block of one holds no voxel."""
-    return layout.planes(field, axis, fill) if isinstance(layout, Block) else _planes(field, axis)
 
 
 class _Track(NamedTuple):
@@ -194,7 +182,7 @@ def _fields(layout: Layout | Block, axis: int, surface: Float[Array, "C X Y Z"],
 
     The fields, which planes hold surfaces, and with `inflow` the image numbers of open ghost voxels.
     """
-    planes = lambda field, fill=0: _planes_of(layout, field, axis, fill)
+    planes = lambda field, fill=0: layout.planes(field, axis, fill)
     fields = _Fields(
         geometry=(planes(layout.plane[0], -1), *(planes(layout.plane[1 + a]) for a in AXES[axis])),
         exitance=planes(surface),
@@ -204,9 +192,8 @@ def _fields(layout: Layout | Block, axis: int, surface: Float[Array, "C X Y Z"],
         thin=medium is not None and medium.thin,
         onward=medium is not None and medium.onward,
     )
-    occupied = jnp.any((fields.geometry[0] != 1.0) & ~_rim(layout, axis), axis=-1)
-    if isinstance(layout, Block):  # as all devices must go the same way
-        occupied = layout.largest(occupied.astype(np.int32)) > 0
+    occupied = jnp.any((fields.geometry[0] != 1.0) & ~layout.rim(axis), axis=-1)
+    occupied = layout.largest(occupied.astype(np.int32)) > 0  # all devices must go the same way
     return fields, occupied | _end_planes(layout, axis), planes(layout.inflow_image, -1) if inflow else None
 
 
@@ -216,26 +203,10 @@ def _end_planes(layout: Layout | Block, axis: int) -> np.ndarray:
     return (number < layout.pad[axis]) | (number >= len(number) - layout.pad[axis])
 
 
-def _rim(layout: Layout | Block, axis: int) -> np.ndarray | Array:
-    """The ghost voxels at the rim of a plane, flat."""
-    if isinstance(layout, Block):
-        return layout.rim(axis)
-    inside = np.ones([layout.padded[a] - 2 * layout.pad[a] for a in AXES[axis][1:]], bool)
-    return ~np.pad(inside, [(layout.pad[a], layout.pad[a]) for a in AXES[axis][1:]]).ravel()
-
-
-def _from_planes(layout: Layout | Block, axis: int, planes: Float[Array, "K C P"]) -> Float[Array, "C X Y Z"]:
-    """The inverse of `_planes`."""
-    if isinstance(layout, Block):
-        return layout.from_planes(planes, axis)
-    field = jnp.moveaxis(planes, 1, 0).reshape(-1, *layout.padded_along(axis))
-    return field.transpose(0, *(1 + AXES[axis].index(a) for a in range(3)))
-
-
 def _track(layout: Layout | Block, axis: int, fields: _Fields, occupied: Array) -> _Track:
     count, height, width = layout.padded_along(axis)
     periodic, wrap_v = layout.pad[axis] == 0, layout.pad[AXES[axis][2]] == 0
-    rim, ring = _rim(layout, axis), layout.ring(axis) if isinstance(layout, Block) else None
+    rim, ring = layout.rim(axis), layout.ring(axis)
     return _Track(fields, occupied, rim, count, height * width, width, periodic, wrap_v and ring is None, layout.spacing, ring)
 
 
@@ -306,13 +277,11 @@ def count_laps(
         def lap(state):
             number, rays, _ = state
             rays = track.lap(own, number * track.count, rays, lambda _: None)
-            return number + 1, rays, largest(jnp.max(rays))
+            return number + 1, rays, layout.largest(jnp.max(rays))
 
         rays = jnp.where(own.weight[:, None, None] > 0, jnp.ones((1, bands, track.area), dark.dtype), 0.0)
         more = lambda state: (state[0] < most) & (state[2] > 1e-6)
         return lax.while_loop(more, lap, (jnp.int32(0), rays, jnp.max(rays)))[0] + 1
-
-    largest = layout.largest if isinstance(layout, Block) else lambda value: value
 
     counted, longest = [], jnp.int32(1)
     for axis, own in enumerate(ordinates):
@@ -499,10 +468,10 @@ def _cross(rays, chords: Chords, fields: _Fields, length, entering, track: _Trac
 def _uncross(chords: Chords, fields: _Fields, length, entering, track: _Track, cut: bool, like: tuple, asked: tuple):
     """The transpose of `_cross`, segment by segment: JAX's own, of the shifts, would be several times slower."""
     to_starts, rays, passing = asked
-    plane, total = _facing(fields, chords) if cut else None, None
+    plane, backs = _facing(fields, chords) if cut else None, []
     # What is sent, of each direction for itself: summed as a product with ones, which XLA does vectorise.
-    number_of = len(rays)
-    like = like[0], jax.tree.map(lambda a: jax.ShapeDtypeStruct((number_of, *a.shape), a.dtype), like[1]), like[2]
+    directions = len(rays)
+    like = like[0], jax.tree.map(lambda a: jax.ShapeDtypeStruct((directions, *a.shape), a.dtype), like[1]), like[2]
     for number in (2, 1, 0):
 
         def segment(rays, sent, light, number=number):
@@ -510,12 +479,12 @@ def _uncross(chords: Chords, fields: _Fields, length, entering, track: _Track, c
             return _segment(number, rays, chords, sending, lit, length, entering(light), track, passing is not None)
 
         rays, *back = jax.linear_transpose(segment, *like)((rays, passing))
-        total = back if total is None else jax.tree.map(jnp.add, total, back)
+        backs.append(back)
         rays = rays + to_starts[number]
         if number:
             rays = shift(lax.optimization_barrier(rays), -chords.offsets[number - 1], track.width, track.wrap_v, track.ring)
-    sent, light = total or ((), None)
-    return rays, jax.tree.map(lambda a: jnp.tensordot(jnp.ones(number_of, a.dtype), a, 1), sent), light
+    sent, light = jax.tree.map(lambda *parts: sum(parts), *backs)
+    return rays, jax.tree.map(lambda a: jnp.tensordot(jnp.ones(directions, a.dtype), a, 1), sent), light
 
 
 def _segment(number: int, rays, chords: Chords, fields: _Fields, plane: _Plane | None, length, entering, track, fluence: bool):
@@ -644,11 +613,9 @@ def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinat
     for axis, (own, reads) in enumerate(zip(ordinates, layout.reads, strict=True)):
         order = AXES[axis]
         planes = jnp.where(layout.buried, -1.0, layout.plane[0]), *(layout.plane[1 + a] for a in order)
-        geometry = tuple(_planes(field, axis) for field in planes)
+        geometry = tuple(layout.planes(field, axis) for field in planes)
         padded = layout.pad[order[0]] > 0, layout.pad[order[1]] > 0, layout.pad[order[2]] > 0
-        bits = tuple(_hit_bits(geometry, layout.padded_along(axis), padded, own, r) for r in reads)
-        empty = lambda x: x is None
-        found.append(eqx.tree_at(lambda o: (o.hit_bits, o.probe_bits), own, bits, is_leaf=empty))
+        found.append(own.marked(*(_hit_bits(geometry, layout.padded_along(axis), padded, own, r) for r in reads)))
     return tuple(found)
 
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import equinox as eqx
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
@@ -103,12 +102,8 @@ def slopes_over(layout: Layout | Partition, source: Array, albedo: Array, extinc
 def _parted(ordinates: tuple[Ordinates, ...]) -> tuple[tuple[Ordinates, ...], _Marks]:
     """What is the same on all devices, and the marks of hits, which are not."""
     marks: _Marks = [(own.hit_bits, own.probe_bits) for own in ordinates]
-    return tuple(_marked(own, (None, None)) for own in ordinates), marks
+    return tuple(own.marked(None, None) for own in ordinates), marks
 
 
 def _joined(ordinates: tuple[Ordinates, ...], marks: _Marks) -> tuple[Ordinates, ...]:
-    return tuple(_marked(own, bits) for own, bits in zip(ordinates, marks, strict=True))
-
-
-def _marked(own: Ordinates, bits: tuple[Array | None, Array | None]) -> Ordinates:
-    return eqx.tree_at(lambda o: (o.hit_bits, o.probe_bits), own, bits, is_leaf=lambda x: x is None)
+    return tuple(own.marked(*bits) for own, bits in zip(ordinates, marks, strict=True))

@@ -16,7 +16,6 @@ Public: `source_slopes`, `thickness`, `flattening`, `THIN`.
 from __future__ import annotations
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
 from ..layout import Layout
@@ -52,22 +51,9 @@ def source_slopes(
     there = scatters.astype(source.dtype)
     slopes = []
     for axis in range(3):
-        before, after = (_neighbour(layout, mean, axis, step) for step in (-1, 1))
-        has_before, has_after = (_neighbour(layout, there, axis, step) for step in (-1, 1))
+        before, after = (layout.neighbour(mean, axis, step) for step in (-1, 1))
+        has_before, has_after = (layout.neighbour(there, axis, step) for step in (-1, 1))
         both = has_before + has_after
         rise = has_after * (after - mean) + has_before * (mean - before)
         slopes.append(strength * rise / jnp.maximum(both, 1.0))
     return tuple(slopes)
-
-
-def _neighbour(layout: Layout | Block, field: Array, axis: int, step: int) -> Array:
-    """Each voxel's neighbour; 0 beyond the ends."""
-    if isinstance(layout, Block):
-        return layout.neighbour(field, axis, step)
-    periodic = layout.pad[axis] == 0
-    axis += 1
-    moved = jnp.roll(field, -step, axis)
-    if periodic:
-        return moved
-    at = lax.broadcasted_iota(jnp.int32, field.shape, axis)
-    return jnp.where(at == (field.shape[axis] - 1 if step > 0 else 0), 0.0, moved)

@@ -36,11 +36,9 @@ from .characteristic import (
     _chunk,
     _entering,
     _fields,
-    _from_planes,
     _mean_of_hits,
     _mean_of_paths,
     _on_axis,
-    _planes_of,
     _read_tile,
     _row,
     _Track,
@@ -105,11 +103,11 @@ def adjoint_sweep(
     def one_axis(axis, own: Ordinates, reads: AxisReads, sums):
         fields, occupied, images = _on_axis(axis, lambda a: _fields(layout, a, sent, medium, inflow is not None))
         track = _track(layout, axis if isinstance(axis, int) else 0, fields, occupied)
-        planes = lambda field: None if field is None else _on_axis(axis, lambda a: _planes_of(layout, field, a))
+        planes = lambda field: None if field is None else _on_axis(axis, lambda a: layout.planes(field, a))
         rows = tuple(at_elements[:, r.element] for r in reads)
         entry = None if inflow is None else _Entry(images, inflow.radiance, planes(factor))
         back, light = _axis_adjoint(track, own, reads, rows, planes(asked), entry, whole)
-        back = _on_axis(axis, lambda a: [_from_planes(layout, a, field) for field in _in_scene_order(back, a, sloped)])
+        back = _on_axis(axis, lambda a: [layout.from_planes(field, a) for field in _in_scene_order(back, a, sloped)])
         fields, total = sums
         return [t + f for t, f in zip(fields, back, strict=True)], None if light is None else total + light
 
