@@ -30,6 +30,7 @@ _FACES = 6  # faces told apart in a voxel, at most
 _INWARD = 1e-3
 _NEAR = 0.5 * np.sqrt(3) + 0.1  # voxels: centres this near to a surface may have it in their voxel
 _PATCH = 8  # samples a side on an element's plane
+_SLIVER = 0.1  # voxel faces: patches smaller than this
 _BATCH = 1 << 15  # voxels analysed at once
 
 
@@ -211,13 +212,23 @@ def _faces(scene: Scene, field: _DistanceField, voxels: np.ndarray, distance: np
     patch, weight = patch_points(normal, on_plane)
     # The plane is the face as far as the distance's slope is its normal: past an edge it is not.
     error, slope = field.gradient(center[rows, None] + patch * spacing)
-    real = weight * ((np.abs(error) < np.where(creased, 0.1, 0.5)[:, None]) & (np.einsum("msi,mi->ms", slope, normal) > 0.7))
+    there = (np.abs(error) < np.where(creased, 0.1, 0.5)[:, None]) & (np.einsum("msi,mi->ms", slope, normal) > 0.7)
+    real = weight * there
     covered, whole = real.sum(1), weight.sum(1)
-    area = plane_area_in_voxel(normal, on_plane) * covered / np.maximum(whole, 1e-9)
+    area = plane_area_in_voxel(normal, on_plane)
+    # Corners that a smooth surface cuts off may be too small for the grid of points.
+    corner = _on_plane_in_voxel(normal, on_plane)
+    sliver = rounded & (whole < _SLIVER) & _on_face(field, center[rows] + corner * spacing, normal)
+    covered, whole = (np.where(sliver, area, x) for x in (covered, whole))
+    area = area * covered / np.maximum(whole, 1e-9)
+    curved = np.nonzero(~sliver & ((np.abs(error) * real).max(1, initial=0.0) > 1e-6))[0]
+    parts = (center[rows], normal, patch, error, slope)
+    area[curved] = _curved_area(field, *(part[curved] for part in parts))
     half_width = 0.5 * np.abs(normal).sum(1)
     owned = (on_plane < half_width - 1e-6) & (on_plane >= -half_width - 1e-6)
-    keep = owned & (covered > 0.02) & (area > 1e-3) & np.isfinite(on_plane)
-    centroid = (patch * real[..., None]).sum(1) / np.maximum(covered, 1e-9)[:, None]
+    keep = owned & (covered > np.where(sliver, 0.0, 0.02)) & (area > 1e-3) & np.isfinite(on_plane)
+    middle = (patch * real[..., None]).sum(1) / np.maximum(covered, 1e-9)[:, None]
+    centroid = np.where(sliver[:, None], corner, middle)
     return {
         "voxel": voxels[rows][keep], "normal": normal[keep], "offset": on_plane[keep], "area": area[keep],
         "centroid": centroid[keep],
@@ -228,6 +239,7 @@ def _refit(field: _DistanceField, center, normal, offset, spacing: float) -> tup
     """Move planes so that over their patches in the voxel the signed distance averages 0 and its slope is theirs."""
     patch, weight = patch_points(normal, offset)
     value, slope = field.gradient(center[:, None] + patch * spacing)
+    weight = weight * (np.einsum("msi,mi->ms", slope, normal) > 0.7)  # not past an edge
     area = weight.sum(1)
     share = weight / np.maximum(area, 1e-9)[:, None]
     mean_value = (value * share).sum(1)
@@ -350,6 +362,45 @@ def patch_points(normal: np.ndarray, offset: np.ndarray, count: int = _PATCH) ->
         points[:, axis, :, u], points[:, axis, :, v], points[:, axis, :, axis] = a, b, np.clip(height, -9, 9)
         weights[:, axis] = (np.abs(height) <= 0.5 + 1e-6) * np.where(np.abs(along) > 1e-3, np.abs(along), 0.0) / count**2
     return points.reshape(len(normal), -1, 3), weights.reshape(len(normal), -1)
+
+
+def _on_plane_in_voxel(normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
+    """The point of each plane in its voxel that is nearest to the centre, (M, 3) from there; a corner if there is none."""
+    # It lies back along the normal, as far as the voxel's faces let each coordinate go.
+    point = lambda back: np.clip(-back[:, None] * normal, -0.5, 0.5)
+    low, high = np.full(len(normal), -1e4), np.full(len(normal), 1e4)
+    for _ in range(50):
+        back = (low + high) / 2
+        ahead = np.einsum("mi,mi->m", normal, point(back)) > -offset
+        low, high = np.where(ahead, back, low), np.where(ahead, high, back)
+    return point(high)
+
+
+def _on_face(field: _DistanceField, points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Whether points are on, or nearly on, a face with this normal."""
+    distance, slope = field.gradient(points)
+    return (np.abs(distance) < 0.1) & (np.einsum("mi,mi->m", slope, normal) > 0.9)
+
+
+def _curved_area(field: _DistanceField, center, normal, patch, distance, slope) -> np.ndarray:
+    """The area of curved surfaces in their voxels, from the `patch_points` of planes near them.
+
+    Points go to the surface along their grid's axis, and stand for the area that the surface's slope there gives them. The
+    planes alone would lack 0.3 % of the area of a ball 7 voxels in radius, and 3 % of a torus whose tube is 3 voxels thick.
+    """
+    count = patch.shape[1] // 3
+    grid = np.repeat(np.eye(3), count, axis=0)  # the axis that each point's grid looks along
+    along = np.einsum("msi,si->ms", slope, grid)
+    move = distance / np.copysign(np.maximum(np.abs(along), 1e-6), along)
+    patch = patch - np.clip(move, -0.5, 0.5)[..., None] * grid
+    distance, slope = field.gradient(center[:, None] + patch * field.spacing)
+    size = np.abs(np.einsum("msi,si->ms", slope, grid))
+    # The part of a point's cell, over which the surface rises as it slopes there, that is in the voxel.
+    rise = (np.abs(slope).sum(2) - size) / np.maximum(size, 1e-6) / np.sqrt(count)
+    below = 0.5 - np.abs(np.einsum("msi,si->ms", patch, grid))
+    inside = np.clip(0.5 + (below + 1e-6) / np.maximum(rise, 1e-6), 0.0, 1.0)
+    same = (np.abs(distance) < 0.02) & (np.einsum("msi,mi->ms", slope, normal) > 0.7)
+    return np.where(same, inside * size, 0.0).sum(1) / count
 
 
 def plane_area_in_voxel(normal: np.ndarray, offset: np.ndarray) -> np.ndarray:
