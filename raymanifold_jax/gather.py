@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import checks
+from .cubature import mean_of_rays
 from .direct import emitter_light, sky_radiance, small_emitters
 from .directions import gathering
 from .interpolation import ElementTable, element_table, interpolate_irradiance, slopes
@@ -38,8 +39,7 @@ _OFF = 2e-3  # voxels: how far off a surface rays start
 _DEEP = 0.5  # voxels: how far inside a solid a point on its surface may be by mistake
 _POINTS = 256  # points of a final gather at once, with _RAYS rays each
 _RAYS = 1024
-_SPREAD = 0.0015  # of the mean: a standard error above this asks for four times as many rays
-_REFINEMENTS = 2
+_TOLERANCE = 1e-3  # standard error of a gather, of the mean
 _BLOCKS = 5  # of a volume source, along each axis, for one of the solve's
 
 
@@ -75,9 +75,9 @@ def irradiance(solution: Solution, points: Any, normals: Any, directions: int | 
     """Irradiance at surface points by a final gather, (n, 3) each, in W m^-2.
 
     The mean of the radiance over `directions` directions spread over the hemisphere around each normal, and the light
-    of suns, point lights, small emitting surfaces and compact volume sources exactly. By default 1024 directions, and up to
-    16384 at points where quarters of them disagree by more than 0.15 %. The normals may have any length but 0. Points up to
-    half a voxel inside a solid or outside the lattice are taken to be on the surface.
+    of suns, point lights, small emitting surfaces and compact volume sources exactly. By default 1024 directions and, at
+    points that see edges of bright and dark, up to 25 000 more along them (see `cubature`). The normals may have any length
+    but 0. Points up to half a voxel inside a solid or outside the lattice are taken to be on the surface.
 
     **Raises** `TypeError` for anything but a solution, `ValueError` for NaN, another shape, a normal of length 0, or points
     further inside.
@@ -93,8 +93,9 @@ def fluence(solution: Solution, points: Any, directions: int | None = None) -> F
     """Fluence at points (n, 3) of the space that solids leave free, in W m^-2, by a final gather.
 
     4 pi times the mean of the radiance over `directions` directions, and the light of suns, point lights, small emitting
-    surfaces and compact volume sources exactly. By default 2048 directions, and up to 32768 where quarters of them disagree
-    by more than 0.15 %. With `directions=0` it is interpolated between the voxels instead: quick, for many points.
+    surfaces and compact volume sources exactly. By default 2048 directions and, where edges of bright and dark are seen, up to
+    25 000 more along them (see `cubature`). With `directions=0` it is interpolated between the voxels instead: quick, for
+    many points.
 
     **Raises** `TypeError` for anything but a solution, `ValueError` for NaN, another shape, or points outside the lattice or
     inside a solid.
@@ -151,40 +152,24 @@ def _mean_of_rays(field: LightField, points: Any, normals: Any, number: int | No
 
     Without a `number` of rays as many as it takes, where that can be known now.
     """
-    if number is not None:
-        return _mean_and_spread(field, points, normals, number)[0]
-    number = _fewest(normals)
-    mean, spread = _mean_and_spread(field, points, normals, number)
-    left = np.arange(len(points))
-    for _ in range(0 if checks.is_traced((spread, points)) else _REFINEMENTS):
-        left = left[np.asarray(spread)]
-        if not len(left):
-            break
-        number *= 4
-        better, spread = _mean_and_spread(field, points[left], None if normals is None else normals[left], number)
-        mean = mean.at[left].set(better)
-    return mean
+    whole = 4 * jnp.pi if normals is None else jnp.pi
+    parts = []
+    size = max(1, _POINTS * _RAYS // (number or _fewest(normals)))
+    for i in range(0, len(points), size):
+        block, around = points[i : i + size], None if normals is None else normals[i : i + size]
+        see = lambda point, rays, block=block: in_blocks(radiance_along, field, (block[point], rays))
+        if number is None:
+            parts.append(mean_of_rays(see, len(block), around, _TOLERANCE))
+        else:
+            rays = gathering(number, len(block), around).reshape(-1, 3)
+            seen = see(np.repeat(np.arange(len(block)), number), rays)
+            parts.append(seen.reshape(len(block), number, -1).mean(1))
+    return whole * jnp.concatenate(parts)
 
 
 def _fewest(normals: Any) -> int:
     """Rays around a normal, or over the whole sphere, to begin with."""
     return 2 * _RAYS if normals is None else _RAYS
-
-
-def _mean_and_spread(field: LightField, points: Any, normals: Any, number: int) -> tuple[Array, Array]:
-    """The mean, and whether the means of every fourth ray are too far apart for it."""
-    parts = []
-    size = max(1, _POINTS * _RAYS // number)
-    for i in range(0, len(points), size):
-        block = points[i : i + size]
-        rays = gathering(number, len(block), None if normals is None else normals[i : i + size]).reshape(-1, 3)
-        xp = np if isinstance(block, np.ndarray) else jnp
-        seen = in_blocks(radiance_along, field, (xp.repeat(block, number, 0), rays)).reshape(len(block), number, -1)
-        mean = seen.mean(1)
-        quarters = jax.lax.stop_gradient(jnp.stack([seen[:, k::4].mean(1) for k in range(min(4, number))]))
-        parts.append((mean, jnp.any(quarters.std(0) / 2 > _SPREAD * quarters.mean(0), axis=-1)))
-    means, spread = (jnp.concatenate(part) for part in zip(*parts, strict=True))
-    return means * (4 * jnp.pi if normals is None else jnp.pi), spread
 
 
 def outgoing_flux(solution: Solution, side: str) -> Float[Array, "nu nv *bands"]:
