@@ -134,6 +134,7 @@ def plain_readings(solution):
 THICK = 4
 
 
+@pytest.mark.slow
 def test_gradients_in_thick_fog(x64):
     check_gradient(random_scene(0, THICK, lights=1), plain_readings)
 

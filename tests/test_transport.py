@@ -210,6 +210,7 @@ def test_infinite_grey_plates(row, side, width):
     np.testing.assert_allclose(net, problem.expected, atol=3e-5)
 
 
+@pytest.mark.slow
 def test_mirror_is_half_of_the_doubled_scene():
     # Half a box with a ball, a medium and a half sky, mirrored at x = 0, against both halves together. Directions: half
     # of a set and its mirror image. Error budget: float32 rounding.
