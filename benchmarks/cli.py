@@ -132,7 +132,7 @@ def error_vs_time(
     """Sweep sizes, numbers of directions and quadratures; draw error against time."""
     import json
 
-    from .measure import QUADRATURES, Job, run
+    from .measure import PAPER, QUADRATURES, Job, run
     from .record import environment, write
     from .table import accuracy_table
 
@@ -144,7 +144,7 @@ def error_vs_time(
         check_matplotlib()
     sizes = sizes or ((8, 16) if quick else (16, 32, 64))
     counts = counts or ((50, 100) if quick else (50, 100, 200, 400))
-    names = quadratures or (("fibonacci",) if quick else tuple(QUADRATURES))
+    names = quadratures or (("fibonacci",) if quick else (*QUADRATURES, PAPER))
     jobs = [
         Job(problem, size, count, quadrature, repeats)
         for problem in only or ("room", "fog")
@@ -262,10 +262,11 @@ def gradient(size: int, directions: int, cells: int, pixels: int, repeats: int, 
 
 
 def _check_quadrature(name: str) -> None:
-    from .measure import DEFAULT, QUADRATURES
+    from .measure import DEFAULT, PAPER, QUADRATURES
 
-    if name not in (DEFAULT, *QUADRATURES):
-        raise click.UsageError(f"--quadrature: got {name!r}, expected {DEFAULT} or one of {', '.join(QUADRATURES)}")
+    if name not in (DEFAULT, PAPER, *QUADRATURES):
+        expected = f"{DEFAULT}, {PAPER} (its whole scheme) or one of {', '.join(QUADRATURES)}"
+        raise click.UsageError(f"--quadrature: got {name!r}, expected {expected}")
 
 
 def _tell(text: str) -> None:

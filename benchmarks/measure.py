@@ -4,7 +4,7 @@ The first solve compiles; those that follow do not. "compile" is the difference 
 others. Reading values out of a solution (final gathers, pictures) is timed apart, for each reader, likewise without its
 compilation.
 
-Public names: `Job`, `measure`, `run`, `QUADRATURES`.
+Public names: `Job`, `measure`, `run`, `QUADRATURES`, `DEFAULT`, `PAPER`.
 """
 
 import math
@@ -24,10 +24,15 @@ if TYPE_CHECKING:
     from raymanifold_jax.quadrature import Quadrature
 
 
+def _half_width(count: int) -> int:
+    """Of a light ray cube with about as many points."""
+    return max(1, round(math.sqrt((count - 2) / 24)))
+
+
 def _light_ray_cube(count: int) -> "Quadrature":
     import raymanifold_jax as rm
 
-    return rm.quadrature.light_ray_cube(max(1, round(math.sqrt((count - 2) / 24))))
+    return rm.quadrature.light_ray_cube(_half_width(count))
 
 
 def _product(count: int) -> "Quadrature":
@@ -54,6 +59,7 @@ QUADRATURES: Mapping[str, Callable[[int], "Quadrature"]] = MappingProxyType(
     {"fibonacci": _fibonacci, "cube": _cube, "light-ray-cube": _light_ray_cube, "product": _product}
 )
 DEFAULT = "default"  # what `rm.solve` takes
+PAPER = "paper"  # the paper's scheme, which has its own directions
 
 
 @dataclass(frozen=True)
@@ -77,10 +83,14 @@ def measure(job: Job) -> dict[str, Any]:
     case = problems.CASES[job.problem]
     scene = case.build(job.size)
     chosen = QUADRATURES.get(job.quadrature, lambda count: rm.quadrature.for_scene(scene, count))
-    quadrature = chosen(job.directions)
+    options: dict[str, Any] = {"quadrature": chosen(job.directions)}
+    directions = len(options["quadrature"])
+    if job.quadrature == PAPER:
+        cube = rm.LightRayCube(half_width=_half_width(job.directions))
+        options, directions = {"scheme": cube}, 24 * cube.half_width**2 + 2
 
     def solve() -> rm.Solution:
-        solution = rm.solve(scene, quadrature, rtol=case.rtol, progress=False)
+        solution = rm.solve(scene, **options, rtol=case.rtol, progress=False)
         jax.block_until_ready(solution.diffuse_fluence)
         return solution
 
@@ -95,7 +105,7 @@ def measure(job: Job) -> dict[str, Any]:
     return asdict(job) | {
         "title": case.title,
         "errors_of": case.errors_of,
-        "directions": len(quadrature),
+        "directions": directions,
         "voxels": scene.lattice.size,
         "seconds": {
             "first": first,
