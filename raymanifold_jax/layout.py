@@ -65,7 +65,7 @@ class Reads(eqx.Module):
     element: Int[Array, " M"]
     plane: tuple[Float[Array, " M"], ...]  # the element's plane: offset, then the normal along (axis, u, v); padding: 0
     height: Float[Array, " M"]  # of the read voxel's centre above the element's plane, in voxels
-    home: Int[Array, "2 M"]  # the element's own voxel: its plane and its place in the plane
+    image: Int[Array, " M"]  # of which of the layout's element images this is
     first_tile: Int[Array, " K1"]
     tile: int = eqx.field(static=True)
 
@@ -88,6 +88,7 @@ class Layout(eqx.Module):
     elements: int = eqx.field(static=True)
     plane: Float[Array, "4 X Y Z"]  # offset and normal of each voxel's surface; free: 1, 0; ghosts: -1, 0
     cell: Int[Array, " I"]  # voxel of each element image, flat in the padded lattice
+    face: Float[Array, "4 I"]  # and its plane: offset and normal
     source_element: Int[Array, " I"]
     share: Float[Array, " I"]  # its share of that voxel's exitance
     buried: Bool[Array, "X Y Z"]  # voxels wholly inside solids
@@ -201,7 +202,7 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
     away = probe - voxel
     probe = np.where(periodic, probe % padded, np.clip(probe, 0, np.array(padded) - 1))
     probing = ~blocked[tuple(probe.T)]
-    rows = {"voxel": voxel, "element": element, "offset": offset, "normal": normal, "away": np.zeros_like(away)}
+    rows = {"element": element, "image": np.arange(len(flat)), "offset": offset, "normal": normal, "away": np.zeros_like(away)}
     probes = {key: value[probing] for key, value in (rows | {"away": away}).items()}
     real = np.dtype(jnp.zeros(0).dtype)
     return Layout(
@@ -213,6 +214,7 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
         elements=len(surfaces),
         plane=jnp.asarray(plane, real),
         cell=jnp.asarray(flat, np.int32),
+        face=jnp.asarray(np.column_stack([offset, normal]).T, real),
         source_element=jnp.asarray(element, np.int32),
         share=jnp.asarray(area / np.maximum(total[flat], 1e-300), real),
         buried=jnp.asarray(blocked & ~ghost),
@@ -297,7 +299,7 @@ def _axis_reads(
         element=spread(rows["element"], np.int32),
         plane=tuple(spread(values, real) for values in (rows["offset"], *rows["normal"].T[[axis, u, v]])),
         height=spread(rows["offset"] + np.einsum("mi,mi->m", rows["normal"], rows["away"]), real),
-        home=spread(np.column_stack([rows["voxel"][:, axis], flat(rows["voxel"])]), np.int32),
+        image=spread(rows["image"], np.int32),
         first_tile=jnp.asarray(first_tile, np.int32),
         tile=tile,
     )

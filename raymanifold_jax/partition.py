@@ -448,7 +448,7 @@ def _place_reads(reads: Reads, cut: _Cut, place: Callable) -> Reads:
         element=spread(reads.element),
         plane=tuple(spread(component) for component in reads.plane),
         height=spread(reads.height),
-        home=spread(reads.home),
+        image=spread(reads.image),
         first_tile=place(cut.first_tile.astype(np.int32), TABLE),
         tile=reads.tile,
     )

@@ -614,17 +614,27 @@ def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinat
         order = AXES[axis]
         planes = jnp.where(layout.buried, -1.0, layout.plane[0]), *(layout.plane[1 + a] for a in order)
         geometry = tuple(layout.planes(field, axis) for field in planes)
-        padded = layout.pad[order[0]] > 0, layout.pad[order[1]] > 0, layout.pad[order[2]] > 0
-        found.append(own.marked(*(_hit_bits(geometry, layout.padded_along(axis), padded, own, r) for r in reads)))
+        shape, padded = layout.padded_along(axis), tuple(layout.pad[a] > 0 for a in order)
+        voxel = jnp.unravel_index(layout.cell, layout.padded)
+        home = jnp.stack([voxel[axis], voxel[order[1]] * shape[2] + voxel[order[2]]])
+        face = layout.face[jnp.array([0, *(1 + a for a in order)])]
+        bits = _hit_bits(geometry, shape, padded, own, face, home)
+        found.append(own.marked(*(bits[:, :, r.image] for r in reads)))
     return tuple(found)
 
 
 @eqx.filter_jit  # by axis: in a cubic lattice they share a program
 def _hit_bits(
-    geometry: tuple[Array, ...], shape: tuple[int, int, int], padded: tuple[bool, ...], ordinates: Ordinates, reads: Reads
-) -> UInt32[Array, "G words M"]:
+    geometry: tuple[Array, ...],
+    shape: tuple[int, int, int],
+    padded: tuple[bool, ...],
+    ordinates: Ordinates,
+    face: Float[Array, "4 I"],
+    home: Int[Array, "2 I"],
+) -> UInt32[Array, "G words I"]:
+    """For each element image, by its plane along (axis, u, v) and its own voxel: the plane that is in and its place there."""
     if ordinates.weight.shape[0] == 0:
-        return jnp.zeros((0, 1, reads.cell.shape[0]), jnp.uint32)
+        return jnp.zeros((0, 1, face.shape[1]), jnp.uint32)
     count, height, width = shape
     rim = [jnp.arange(n) for n in shape]
     rim = [(r == 0) | (r == r[-1]) if p else r < 0 for r, p in zip(rim, padded, strict=True)]
@@ -656,6 +666,6 @@ def _hit_bits(
         return jnp.sum(flags << jnp.arange(32, dtype=jnp.uint32), axis=1, dtype=jnp.uint32)
 
     def of_chunk(number):
-        return jax.vmap(partial(one, _chunk(ordinates, number)), in_axes=(0, 1), out_axes=1)(reads.plane, reads.home)
+        return jax.vmap(partial(one, _chunk(ordinates, number)), in_axes=(1, 1), out_axes=1)(face, home)
 
     return lax.map(of_chunk, jnp.arange(ordinates.weight.shape[0]))
