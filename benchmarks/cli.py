@@ -207,11 +207,15 @@ def peer(
 @_json
 def stability(quick: bool, json_file: Path | None) -> None:
     """Extreme depths, albedos, contrasts, radiances, directions and shapes; float32 against float64."""
+    import jax
+
     from .record import environment, write
     from .stability import cases, measure, stability_table
 
     rows = []
-    for case in cases(quick):
+    for number, case in enumerate(cases(quick)):
+        if number % 50 == 49:  # each compiled program holds regions of memory, of which a process gets some ten thousand
+            jax.clear_caches()
         rows.append(measure(case, _tell))
         write(json_file, _QUESTIONS["stability"], rows, environment=environment())
     _print_environment(environment())

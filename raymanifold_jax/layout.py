@@ -155,6 +155,11 @@ def flat_planes(field: Float[Array, "*C X Y Z"], axis: int) -> Float[Array, "K *
     return turned.reshape(*turned.shape[:-2], -1)
 
 
+def picked(values: Array, index: Int[Array, " M"]) -> Array:
+    """values[..., index]; zeros where a scene has no elements to pick from, and rows of reads only pad."""
+    return values[..., index] if values.shape[-1] else jnp.zeros((*values.shape[:-1], len(index)), values.dtype)
+
+
 def exitance_in_voxels(
     exitance: Float[Array, "C E"],
     element: Int[Array, " I"],

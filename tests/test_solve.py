@@ -2,6 +2,7 @@
 
 import functools
 
+import jax
 import numpy as np
 import optimistix
 import problems
@@ -136,3 +137,23 @@ def test_energy_balance_counts_each_way_in_and_out():
     lone = rm.solve(problems.lone_ball(0.5).scene, DIRECTIONS, progress=False)
     assert float(lone.energy.entering) == pytest.approx(6 * np.pi, rel=1e-5)
     assert abs(float(lone.energy.imbalance)) < 0.02
+
+
+def _without_end(absorption) -> rm.Solution:
+    sides = rm.Boundary(rm.PERIODIC, rm.PERIODIC, rm.PERIODIC)
+    scene = rm.Scene(rm.Lattice((3, 4, 5)), medium=rm.Medium(0.4, absorption, 2.0), boundary=sides)
+    return rm.solve(scene, DIRECTIONS, rtol=1e-10, progress=False)
+
+
+def test_a_medium_without_end(x64):
+    # Periodic along all axes, without any surface: the fluence is 4 pi emission / absorption, and so it is by a final gather.
+    solution = _without_end(0.5)
+    assert solution.converged and len(solution.surfaces.areas) == 0
+    np.testing.assert_allclose(solution.fluence, 16 * np.pi, rtol=1e-8)
+    np.testing.assert_allclose(rm.fluence(solution, [[1.0, 2.0, 3.0]], directions=16), 16 * np.pi, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_derivative_of_a_medium_without_end(x64):
+    slope = jax.grad(lambda absorption: _without_end(absorption).fluence[1, 1, 1])(0.5)
+    np.testing.assert_allclose(slope, -32 * np.pi, rtol=1e-6)

@@ -29,7 +29,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt32
 
-from ..layout import AXES, AxisReads, Layout, Ordinates, Reads
+from ..layout import AXES, AxisReads, Layout, Ordinates, Reads, picked
 from ..partition import Block
 from ..shift import Ring, shift
 from .slopes import thickness
@@ -619,7 +619,7 @@ def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinat
         home = jnp.stack([voxel[axis], voxel[order[1]] * shape[2] + voxel[order[2]]])
         face = layout.face[jnp.array([0, *(1 + a for a in order)])]
         bits = _hit_bits(geometry, shape, padded, own, face, home)
-        found.append(own.marked(*(bits[:, :, r.image] for r in reads)))
+        found.append(own.marked(*(picked(bits, r.image) for r in reads)))
     return tuple(found)
 
 

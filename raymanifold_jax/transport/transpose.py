@@ -28,7 +28,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
 
-from ..layout import AXES, AxisReads, Layout, Ordinates
+from ..layout import AXES, AxisReads, Layout, Ordinates, picked
 from ..partition import Block
 from .characteristic import (
     Inflow,
@@ -104,7 +104,7 @@ def adjoint_sweep(
         fields, occupied, images = _on_axis(axis, lambda a: _fields(layout, a, sent, medium, inflow is not None))
         track = _track(layout, axis if isinstance(axis, int) else 0, fields, occupied)
         planes = lambda field: None if field is None else _on_axis(axis, lambda a: layout.planes(field, a))
-        rows = tuple(at_elements[:, r.element] for r in reads)
+        rows = tuple(picked(at_elements, r.element) for r in reads)
         entry = None if inflow is None else _Entry(images, inflow.radiance, planes(factor))
         back, light = _axis_adjoint(track, own, reads, rows, planes(asked), entry, whole)
         back = _on_axis(axis, lambda a: [layout.from_planes(field, a) for field in _in_scene_order(back, a, sloped)])
