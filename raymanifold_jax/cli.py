@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from .scene import Scene
-    from .scenes import SceneEntry
+    from .scenes import SceneEntry, View
     from .solution import Solution
 
 _BRIGHT, _BRIGHT_SHARE = 0.9, 99.0  # auto exposure: this percentile of the radiance becomes this much of white
@@ -64,6 +64,12 @@ def main() -> None:
 )
 @click.option("--camera", metavar="NAME", help="The view: `raymanifold scenes` lists them. [default: the first]")
 @click.option("--all-views", is_flag=True, help="All of the scene's views, as FILE-VIEW.exr.")
+@click.option(
+    "--turntable",
+    type=click.IntRange(1, 9999),
+    metavar="N",
+    help="N views from all around, as FILE-000.exr and so on: one solve, a film.",
+)
 @click.option(
     "--resolution", type=Resolution(), default="512", metavar="WxH", show_default=True, help="Pixels: 640x480, or 512."
 )
@@ -95,6 +101,7 @@ def render(
     out: Path | None,
     camera: str | None,
     all_views: bool,
+    turntable: int | None,
     resolution: tuple[int, int],
     samples: int,
     exposure: float | None,
@@ -102,14 +109,16 @@ def render(
     **settings: Any,
 ) -> None:
     """Solve SCENE (ring, three-balls, room or a file.toml) and write pictures of it."""
-    if camera is not None and all_views:
-        raise click.UsageError("--camera and --all-views exclude each other; leave one out", ctx)
+    if (camera is not None) + all_views + (turntable is not None) > 1:
+        raise click.UsageError("--camera, --all-views and --turntable exclude each other; leave all but one out", ctx)
     if camera is not None and camera not in scene.views:
         got = f"--camera: got {camera!r}, expected one of {', '.join(scene.views)}"
         raise click.UsageError(f"{got}; leave it out for {next(iter(scene.views))!r}", ctx)
     out = Path(f"{scene.name}.exr") if out is None else out
-    wanted = list(scene.views) if all_views else [camera or next(iter(scene.views))]
-    files = {view: out.with_stem(f"{out.stem}-{view}") if all_views else out for view in wanted}
+    available = scene.views if turntable is None else _turntable(turntable)
+    several = all_views or turntable is not None
+    wanted = list(available) if several else [camera or next(iter(available))]
+    files = {view: out.with_stem(f"{out.stem}-{view}") if several else out for view in wanted}
     for file in files.values():
         for target in (file, file.with_suffix(".png")):
             check_writable(target, ctx)
@@ -117,7 +126,7 @@ def render(
     with one_line_errors():
         _start(settings["pe"])
         built = _build(scene, size, settings["directions"])
-        views = {view: make(built.lattice, resolution) for view, make in scene.views.items()}
+        views = {view: make(built.lattice, resolution) for view, make in available.items()}
         solution, seconds = _solve(built, **settings)
 
         import raymanifold_jax as rm
@@ -256,6 +265,12 @@ def _start(pe: tuple[int, int] | None) -> None:
         import raymanifold_jax as rm
 
         rm.pe_array(*pe)
+
+
+def _turntable(frames: int) -> "Mapping[str, View]":
+    from .scenes import turntable
+
+    return turntable(frames)
 
 
 def _build(entry: "SceneEntry", size: int, directions: int) -> "Scene":

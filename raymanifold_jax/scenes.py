@@ -6,10 +6,11 @@ All fill the unit cube, z up, with n voxels a side:
 - `three_balls_in_fog`: three balls in an open box filled with fog, under the sun (figure 5);
 - `room`: a closed room with a block, lit by a square in its ceiling.
 
-`SCENES` lists them by name, with a size to start from and their views; `cameras` makes a scene's views at a resolution.
+`SCENES` lists them by name, with a size to start from and their views; `cameras` makes a scene's views at a resolution,
+`turntable` views of any scene from all around.
 Walls are seen from inside only, so a camera outside looks through the wall in front of it.
 
-Public names: `ring`, `three_balls_in_fog`, `room`, `SCENES`, `SceneEntry`, `find`, `cameras`, `STANDARD_VIEWS`.
+Public names: `ring`, `three_balls_in_fog`, `room`, `SCENES`, `SceneEntry`, `find`, `cameras`, `turntable`, `STANDARD_VIEWS`.
 """
 
 import difflib
@@ -155,8 +156,25 @@ def _top(lattice: Lattice, resolution: Resolution, depth: float = 0.0) -> Orthog
     return _parallel((x, y, lattice.upper[2] - depth), (0, 0, -1), (0, 1, 0), (across, upward), resolution)
 
 
-def _oblique(azimuth: float, elevation: float, lattice: Lattice, resolution: Resolution) -> OrthographicCamera:
-    """A parallel projection from a side, `azimuth` (degrees from +x), looking down on the middle of the box."""
+def turntable(frames: int, elevation: float = 35.0) -> dict[str, View]:
+    """Views once around any scene, from `elevation` degrees above its floor: as many as `frames`, "000" the one from -y.
+
+    **Raises** `TypeError` or `ValueError` for anything but a whole number of frames, at least 1, and 0 to 90 degrees.
+    """
+    frames = checks.positive_int("frames", frames)
+    if not (isinstance(elevation, int | float) and 0 <= elevation <= 90):
+        checks.fail("elevation", repr(elevation), "degrees from 0 to 90", "35 looks down into an open box")
+    digits = max(3, len(str(frames - 1)))
+    return {f"{i:0{digits}d}": partial(_oblique, 360 * i / frames - 90, elevation, turning=True) for i in range(frames)}
+
+
+def _oblique(
+    azimuth: float, elevation: float, lattice: Lattice, resolution: Resolution, turning: bool = False
+) -> OrthographicCamera:
+    """A parallel projection from a side, `azimuth` (degrees from +x), looking down on the middle of the box.
+
+    `turning`: at the scale at which the box fits into the picture from any side.
+    """
     a, e = math.radians(azimuth), math.radians(elevation)
     x, y, z = (lattice.lower + lattice.upper) / 2
     side = max(lattice.extent)
@@ -164,7 +182,7 @@ def _oblique(azimuth: float, elevation: float, lattice: Lattice, resolution: Res
     # Two sides away the picture plane is outside the box everywhere.
     center = (x + 2 * side * towards[0], y + 2 * side * towards[1], z + 2 * side * towards[2])
     # The floor's depth and the walls' height, foreshortened, and a margin.
-    margin = 1.03 * side
+    margin = 1.03 * side * (math.sqrt(2) if turning else 1.0)
     extent = (margin, margin * (math.sin(e) + math.cos(e)))
     return _parallel(center, (-towards[0], -towards[1], -towards[2]), (0, 0, 1), extent, resolution)
 

@@ -109,6 +109,8 @@ bad_render_values = [
     (["ring", "--out", "x" * 300 + ".exr"], "choose another name"),
     (["ring", "--camera", "front"], "got 'front', expected one of south, east, north, west, top"),
     (["ring", "--camera", "top", "--all-views"], "exclude each other"),
+    (["ring", "--turntable", "4", "--all-views"], "exclude each other"),
+    (["ring", "--turntable", "0"], "0 is not in the range"),
     (["ring", "--resolution", "0"], "got '0', expected pixels from 1 to 16384"),
     (["ring", "--resolution", "64x"], "got '64x', expected"),
     (["ring", "--resolution", "1x2x3"], "got '1x2x3', expected"),
@@ -184,6 +186,13 @@ def test_all_views_share_one_exposure(library, tmp_path):
     headers = [read_exr(path)[2] for path in tmp_path.glob("*.exr")]
     assert len({header["raymanifold.exposure"] for header in headers}) == 1
     assert {header["raymanifold.camera"] for header in headers} == set(scenes.SCENES["ring"].views)
+
+
+def test_turntable(library, tmp_path):
+    result = run("render", "ring", "--size", "8", "--resolution", "8", "--turntable", "3", "--out", "r.exr")
+    assert result.exit_code == 0, result.output
+    assert set(os.listdir(tmp_path)) == {f"r-{i:03d}.{kind}" for i in range(3) for kind in ("exr", "png")}
+    assert len(library.asked) == 1  # one solve
 
 
 def test_auto_exposure():

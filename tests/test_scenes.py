@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from raymanifold_jax import OPEN, OrthographicCamera, Sun, Wall, memory, scenes
+from raymanifold_jax import OPEN, Lattice, OrthographicCamera, Sun, Wall, memory, scenes
 
 names = pytest.mark.parametrize("name", scenes.SCENES)
 corners = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1], indexing="ij"), -1).reshape(-1, 3)
@@ -155,3 +155,23 @@ def test_control_groups_limit_memory(tmp_path, version):
     own.write_text("0::/outer/inner\n" if version == 2 else "5:cpu:/outer\n4:memory:/outer/inner\n")
     assert memory._control_groups(tmp_path, own) == [65]
     assert memory._control_groups(tmp_path, tmp_path / "missing") == []
+
+
+def test_turntable_goes_once_around_and_keeps_the_scene_in_view():
+    lattice = Lattice((8, 6, 4))
+    cameras = [make(lattice, (40, 30)) for make in scenes.turntable(4, elevation=20.0).values()]
+    towards = np.array([camera.direction for camera in cameras])
+    np.testing.assert_allclose(towards[:, :2], np.cos(np.radians(20)) * np.array([[0, 1], [-1, 0], [0, -1], [1, 0]]), atol=1e-6)
+    corners = np.array([[x, y, z] for x in (0, 8) for y in (0, 6) for z in (0, 4)])
+    for camera in cameras:
+        frame = camera.frame
+        across = (corners - camera.center) @ np.asarray(frame.right)
+        upward = (corners - camera.center) @ np.asarray(frame.upward)
+        assert np.abs(across).max() <= camera.width / 2
+        assert np.abs(upward).max() <= camera.width * 30 / 40 / 2
+
+
+@pytest.mark.parametrize(("frames", "elevation"), [(0, 35.0), (2.5, 35.0), (4, 91.0), (4, "high")])
+def test_turntable_refuses(frames, elevation):
+    with pytest.raises((TypeError, ValueError), match="expected"):
+        scenes.turntable(frames, elevation)
