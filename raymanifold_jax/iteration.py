@@ -203,22 +203,19 @@ class Iteration:
         return known and not self.converged and self.bound * self._gain <= self.target
 
     def polish(self) -> None:
-        """Two sweeps: one order of bounces more, which smooths the residual, and a closer look at what is left.
+        """A closer look at the residual; else, by two sweeps more, at what one order of bounces, which smooths it, leaves.
 
         If the bound does not meet the target then, everything stays as it was, for the solver to go on.
         """
-        weights, slack, begun = self.certificate.weights, self.certificate.slack, (self.arriving, self.residual)
-        assert weights is not None and slack is not None
-        before = self.bound
+        begun, before = (self.arriving, self.residual), self.bound
+        self._look_closer()
+        if self.over:
+            return
         order, residual = self.system.bounce(self.residual)
         self.reach(self.arriving + order, residual)
         if self.over:
             return
-        u = self.system.precondition(jax.tree.map(jnp.abs, residual))
-        tight = float(_bounded(weights, slack, residual, u, self.system.bounce(u)[1]))
-        self.spend(1)
-        self._tight = tight if math.isfinite(tight) else math.inf
-        self._meter.update(self.sweeps, math.pi * self.bound, math.pi * self.target)
+        self._look_closer()
         if not self.converged:
             # Not again before it can be expected to do.
             self._gain = min(1.5 * self.bound / before, 0.5)
@@ -226,6 +223,21 @@ class Iteration:
             self._tight = math.inf
             self.residuals.pop()
             self.spend(1)
+
+    def tighten(self) -> None:
+        """One sweep more for a bound that is near the error, if the iteration ended on one that makes far too much of it."""
+        known = self.system.near is not None and self.certificate.weights is not None
+        if known and self.converged and self.residuals[-1] > 0 and math.isinf(self._tight) and self.sweeps_left >= 1:
+            self._look_closer()
+
+    def _look_closer(self) -> None:
+        weights, slack = self.certificate.weights, self.certificate.slack
+        assert weights is not None and slack is not None
+        u = self.system.precondition(jax.tree.map(jnp.abs, self.residual))
+        tight = float(_bounded(weights, slack, self.residual, u, self.system.bounce(u)[1]))
+        self.spend(1)
+        self._tight = tight if math.isfinite(tight) else math.inf
+        self._meter.update(self.sweeps, math.pi * self.bound, math.pi * self.target)
 
     @property
     def rounding(self) -> float:

@@ -142,6 +142,7 @@ def _iterate(
         if checkpoint is not None:
             iteration.resume(checkpoint)
         solver.run(iteration)
+        iteration.tighten()
     if traced:
         iteration.system = dataclasses.replace(system, near=near)
         iteration.arriving = attach(iteration.system, iteration.arriving, rtol, most)
