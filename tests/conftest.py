@@ -10,7 +10,7 @@ import pytest
 DEVICES = os.environ.get("RAYMANIFOLD_TEST_DEVICES")  # virtual ones, for tests of meshes; they make all else slower
 collect_ignore = [] if DEVICES else ["test_sharding.py"]
 _MAPS = Path("/proc/self/maps")
-_MANY = 15_000  # of the 65 530 regions of memory that Linux grants a process
+_MANY = 30_000  # of the 65 530 regions of memory that Linux grants a process
 
 
 def pytest_configure(config: pytest.Config) -> None:
@@ -30,7 +30,7 @@ def pytest_configure(config: pytest.Config) -> None:
     )
 
 
-@pytest.fixture(autouse=True, scope="module")
+@pytest.fixture(autouse=True)
 def few_programs() -> Iterator[None]:
     """Forget compiled programs before they are too many: each holds memory regions, and without any left XLA crashes."""
     yield
