@@ -37,7 +37,7 @@ from .volume_sources import compact_sources, emission_of, volume_light, with_emi
 
 _OFF = 2e-3  # voxels: how far off a surface rays start
 _DEEP = 0.5  # voxels: how far inside a solid a point on its surface may be by mistake
-_POINTS = 256  # points of a final gather at once, with _RAYS rays each
+_POINTS = 256  # points of a final gather at once, with _RAYS rays and one band each
 _RAYS = 1024
 _TOLERANCE = 1.5e-3  # standard error of a gather, of the mean
 _BLOCKS = 5  # of a volume source, along each axis, for one of the solve's
@@ -76,7 +76,7 @@ def irradiance(solution: Solution, points: Any, normals: Any, directions: int | 
 
     The mean of the radiance over `directions` directions spread over the hemisphere around each normal, and the light
     of suns, point lights, small emitting surfaces and compact volume sources exactly. By default 1024 directions and, at
-    points that see edges of bright and dark, up to 25 000 more along them (see `cubature`). The normals may have any length
+    points that see edges of bright and dark, up to 40 000 more along them (see `cubature`). The normals may have any length
     but 0. Points up to half a voxel inside a solid or outside the lattice are taken to be on the surface.
 
     **Raises** `TypeError` for anything but a solution, `ValueError` for NaN, another shape, a normal of length 0, or points
@@ -94,7 +94,7 @@ def fluence(solution: Solution, points: Any, directions: int | None = None) -> F
 
     4 pi times the mean of the radiance over `directions` directions, and the light of suns, point lights, small emitting
     surfaces and compact volume sources exactly. By default 2048 directions and, where edges of bright and dark are seen, up to
-    25 000 more along them (see `cubature`). With `directions=0` it is interpolated between the voxels instead: quick, for
+    40 000 more along them (see `cubature`). With `directions=0` it is interpolated between the voxels instead: quick, for
     many points.
 
     **Raises** `TypeError` for anything but a solution, `ValueError` for NaN, another shape, or points outside the lattice or
@@ -154,7 +154,7 @@ def _mean_of_rays(field: LightField, points: Any, normals: Any, number: int | No
     """
     whole = 4 * jnp.pi if normals is None else jnp.pi
     parts = []
-    size = max(1, _POINTS * _RAYS // (number or _fewest(normals)))
+    size = max(1, _POINTS * _RAYS // ((number or _fewest(normals)) * field.scene.bands))
     for i in range(0, len(points), size):
         block, around = points[i : i + size], None if normals is None else normals[i : i + size]
         see = lambda point, rays, block=block: in_blocks(radiance_along, field, (block[point], rays))
