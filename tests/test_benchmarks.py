@@ -53,7 +53,7 @@ def test_a_problem_that_fails_has_a_line_of_its_own():
     [
         (("accuracy", "--only", "kobayashi"), "expected one of kobayashi-1i"),
         (("accuracy", "--quick", "--size", "8"), "exclude one another"),
-        (("accuracy", "--quadrature", "lebedev"), "expected default or one of fibonacci"),
+        (("accuracy", "--quadrature", "lebedev"), "expected default, paper (its whole scheme) or one of fibonacci"),
         (("error-vs-time", "--json", "nowhere/record.json"), "expected a directory that exists"),
     ],
 )
