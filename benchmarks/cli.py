@@ -253,13 +253,17 @@ def convergence(quick: bool, size: int, directions: int, jacobi: int, out: Path 
 @click.option("--cells", type=_at_least(1), default=16, show_default=True, help="Of the floor's texture, along a side.")
 @click.option("--pixels", type=_at_least(1), default=64, show_default=True, help="Of the picture, along a side.")
 @click.option("--repeats", type=_at_least(1), default=3, show_default=True, help="Timed runs after the first.")
+@click.option("--prb", type=_at_least(0), default=0, metavar="SAMPLES", help="Mitsuba's prb beside it (extra: peer); 64, say.")
 @_json
-def gradient(size: int, directions: int, cells: int, pixels: int, repeats: int, json_file: Path | None) -> None:
+def gradient(size: int, directions: int, cells: int, pixels: int, repeats: int, prb: int, json_file: Path | None) -> None:
     """Time and peak memory of a solve, of an image loss, and of the loss with its gradient."""
     from .gradient import gradient_table, measure
     from .record import environment, write
 
-    records = measure(size, directions, cells, pixels, repeats, _tell)
+    try:
+        records = measure(size, directions, cells, pixels, repeats, _tell, prb)
+    except RuntimeError as error:
+        raise click.ClickException(str(error)) from None
     write(json_file, _QUESTIONS["gradient"], records, environment=environment())
     _print_environment(environment())
     click.echo(gradient_table(records))

@@ -5,7 +5,7 @@ They are loaded with `optimize=False`: with the default, Mitsuba 3.9.1 stops sha
 scenes. Mitsuba runs in its fastest mode for one channel, `llvm_ad_mono`, on all cores; without LLVM 19 or newer, in
 `scalar_rgb`, which is slower and cannot be asked for single probes.
 
-Public name: `error_curve`.
+Public names: `error_curve`; `start`, `open_box` and `rectangle` for other scenes.
 """
 
 import os
@@ -45,7 +45,7 @@ def start() -> tuple[Any, str]:
     raise RuntimeError(f"mitsuba: got variants {mi.variants()}, expected llvm_ad_mono or scalar_rgb; install the PyPI wheel")
 
 
-def _rectangle(mi: Any, center: tuple, across: tuple, up: tuple, **more: Any) -> dict[str, Any]:
+def rectangle(mi: Any, center: tuple, across: tuple, up: tuple, **more: Any) -> dict[str, Any]:
     """A rectangle with half-edges `across` and `up`; its normal is across x up."""
     normal = np.cross(across, up)
     columns = np.stack([across, up, normal / np.linalg.norm(normal), center], axis=1)
@@ -60,7 +60,7 @@ def _value(value: float) -> dict[str, Any]:
     return {"type": "uniform", "value": value}
 
 
-def _open_box(mi: Any, albedo: float) -> dict[str, Any]:
+def open_box(mi: Any, albedo: float) -> dict[str, Any]:
     """Floor and four walls of the unit cube, normals inward."""
     h, x, y, z = 0.5, (0.5, 0, 0), (0, 0.5, 0), (0, 0, 0.5)
     sides = {
@@ -71,17 +71,17 @@ def _open_box(mi: Any, albedo: float) -> dict[str, Any]:
         "y+": ((h, 1, h), x, z),
     }
     name = {"x-": "west", "x+": "east", "y-": "south", "y+": "north"}
-    return {name.get(side, side): _rectangle(mi, *where, bsdf=_diffuse(albedo)) for side, where in sides.items()}
+    return {name.get(side, side): rectangle(mi, *where, bsdf=_diffuse(albedo)) for side, where in sides.items()}
 
 
 def _room(mi: Any) -> dict[str, Any]:
-    scene = {"type": "scene", **_open_box(mi, 0.75)}
+    scene = {"type": "scene", **open_box(mi, 0.75)}
     down = lambda x0, x1, y0, y1: (((x0 + x1) / 2, (y0 + y1) / 2, 1), (0, (y1 - y0) / 2, 0), ((x1 - x0) / 2, 0, 0))
     around = [(0, 1, 0, 0.375), (0, 1, 0.625, 1), (0, 0.375, 0.375, 0.625), (0.625, 1, 0.375, 0.625)]
     for number, part in enumerate(around):
-        scene[f"ceiling{number}"] = _rectangle(mi, *down(*part), bsdf=_diffuse(0.75))
+        scene[f"ceiling{number}"] = rectangle(mi, *down(*part), bsdf=_diffuse(0.75))
     light = {"type": "area", "radiance": _value(1.0)}
-    scene["light"] = _rectangle(mi, *down(0.375, 0.625, 0.375, 0.625), bsdf=_diffuse(0.75), emitter=light)
+    scene["light"] = rectangle(mi, *down(0.375, 0.625, 0.375, 0.625), bsdf=_diffuse(0.75), emitter=light)
     place = mi.ScalarTransform4f().translate([0.375, 0.375, 0.25]).scale([0.125, 0.125, 0.25])
     scene["block"] = {"type": "cube", "to_world": place, "bsdf": _diffuse(0.75)}
     scene["integrator"] = {"type": "path", "max_depth": -1}
@@ -92,9 +92,9 @@ def _fog(mi: Any) -> dict[str, Any]:
     extinction, albedo = 3.3, 3.0 / 3.3
     medium = {"type": "homogeneous", "albedo": _value(albedo), "sigma_t": _value(extinction), "phase": {"type": "isotropic"}}
     medium = mi.load_dict(medium)
-    scene = {"type": "scene", **_open_box(mi, 0.9), "fog": medium}
+    scene = {"type": "scene", **open_box(mi, 0.9), "fog": medium}
     roof = ((0.5, 0.5, 1), (0.5, 0, 0), (0, 0.5, 0))
-    scene["roof"] = _rectangle(mi, *roof, bsdf={"type": "null"}, interior=medium)
+    scene["roof"] = rectangle(mi, *roof, bsdf={"type": "null"}, interior=medium)
     for number, center in enumerate(((0.3, 0.35, 0.75), (0.65, 0.3, 0.5), (0.5, 0.7, 0.25))):
         scene[f"ball{number}"] = {"type": "sphere", "center": list(center), "radius": 0.12, "bsdf": _diffuse(0.9)}
     scene["sun"] = {"type": "directional", "direction": [0.2, 0.1, -1], "irradiance": _value(3.0)}

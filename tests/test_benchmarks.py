@@ -122,3 +122,15 @@ def test_catalogue():
             scene = case.build(size)
             assert max(scene.lattice.shape) == size
             assert all(isinstance(target, Target) for target in case.targets(size).values())
+
+
+@pytest.mark.slow
+def test_gradients_are_those_of_path_replay():
+    """The gradient of an image loss in a floor's albedos, against the mean of Mitsuba's: voxels and directions leave 3 %."""
+    pytest.importorskip("mitsuba")
+    from benchmarks.gradient import measure
+
+    *_, ours, theirs = measure(16, 200, cells=4, pixels=32, repeats=1, samples=64)
+    mean, expected = np.array(ours["mean"]), np.array(theirs["mean"])
+    assert mean.shape == (4, 4) and theirs["runs"] >= 32
+    assert np.sqrt(np.mean((mean - expected) ** 2) / np.mean(expected**2)) < 0.04
