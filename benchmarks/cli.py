@@ -15,6 +15,7 @@ _QUESTIONS = {
     "stability": "Does a solve stay finite, non-negative and within its bound where numbers are extreme?",
     "convergence": "How many sweeps to a certified error of 1e-4, over albedos and optical depths?",
     "gradient": "What do an image loss and its gradient cost, beside the solve alone?",
+    "speed": "How long do a sweep, a bounce and a whole solve take, and how does that grow?",
     "peer": "How long do we take for an error of 1 %, and how long does a path tracer on the same cores?",
 }
 
@@ -267,6 +268,33 @@ def gradient(size: int, directions: int, cells: int, pixels: int, repeats: int, 
     write(json_file, _QUESTIONS["gradient"], records, environment=environment())
     _print_environment(environment())
     click.echo(gradient_table(records))
+
+
+@main.command()
+@_quick
+@_sizes("Voxels along a side; may be repeated. [default: 32 and 64; with --quick 8 and 16]")
+@click.option("--directions", "counts", type=_at_least(9), multiple=True, metavar="N", help="[default: 200; with --quick 60]")
+@click.option("--bands", type=_at_least(1), multiple=True, default=(1, 3), show_default=True, help="Of the sweeps.")
+@click.option("--rtol", type=float, default=1e-3, show_default=True, help="Certified error of the solves.")
+@click.option("--repeats", type=_at_least(1), default=5, show_default=True, help="Timed runs after the first.")
+@_json
+def speed(
+    quick: bool, sizes: tuple[int, ...], counts: tuple[int, ...], bands: tuple[int, ...], rtol: float, repeats: int,
+    json_file: Path | None,
+) -> None:  # fmt: skip
+    """Time of sweeps, bounces and whole solves, and how it grows with size and directions."""
+    from .record import environment, write
+    from .speed import solves, speed_table, sweeps
+
+    sizes = sizes or ((8, 16) if quick else (32, 64))
+    counts = counts or ((60,) if quick else (200,))
+    records = []
+    for made in (sweeps(sizes, counts, bands, repeats, _tell), solves(sizes, counts[0], rtol, repeats, _tell)):
+        for record in made:
+            records.append(record)
+            write(json_file, _QUESTIONS["speed"], records, environment=environment())
+    _print_environment(environment())
+    click.echo(speed_table(records))
 
 
 def _check_quadrature(name: str) -> None:

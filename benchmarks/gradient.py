@@ -7,15 +7,14 @@ value and gradient of the same loss are timed in one more process, and the two g
 Public names: `measure`, `gradient_table`.
 """
 
-import multiprocessing
 import statistics
 import time
 from collections.abc import Callable
-from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
 import numpy as np
 
+from .measure import alone
 from .mitsuba_gradient import albedo as compared_albedo
 from .mitsuba_gradient import measure_mitsuba
 
@@ -39,16 +38,11 @@ def measure(
     records = []
     for work in WORKS:
         tell(work)
-        records.append(_alone(_measure, work, size, directions, cells, pixels, repeats))
+        records.append(alone(_measure, work, size, directions, cells, pixels, repeats))
     if samples:
         tell("prb")
-        records.append(_alone(measure_mitsuba, cells, pixels, samples, max(repeats, _SEEDS)))
+        records.append(alone(measure_mitsuba, cells, pixels, samples, max(repeats, _SEEDS)))
     return records
-
-
-def _alone(function: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(function, *arguments).result()
 
 
 def _measure(work: str, size: int, directions: int, cells: int, pixels: int, repeats: int) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from .scene import MIRROR, Scene
 from .surfaces import Surfaces
 
 AXES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # sweep axis, u, v
-_CHUNK = 1 << 18  # rays times bands in one step: a compromise between a CPU's caches and the cost of starting a step
+_CHUNK = 1 << 17  # rays times bands in one step: a compromise between a CPU's caches and the cost of starting a step
 _WORD = 32
 
 

@@ -2,9 +2,11 @@
 
 The need in bytes, with V voxels (a layer of ghosts included), C bands, E surface elements and D directions:
 
-    need = PROGRAM + 4 V (GEOMETRY + C FIELDS) + E (ELEMENT + C D)
+    need = PROGRAM + 4 V (GEOMETRY + C FIELDS) + E (ELEMENT + C D) + links
 
-The last term holds the bits that say which directions hit an element. The constants are for 32-bit numbers.
+C D: the bits that say which directions hit an element. Without a medium there are also links from element to element (see
+`transport.links`), if they do not exceed MOST_LINKS: 8 bytes each, of which 0.75 D an element. The constants are for 32-bit
+numbers.
 
 Public names: `estimate_memory`, `available_memory`, `check_memory`, `gigabytes`.
 """
@@ -16,6 +18,8 @@ PROGRAM = 1_000_000_000  # Python, JAX, compilation, and the work arrays of a ba
 GEOMETRY = 20  # words a voxel: planes, the samples of the signed distance, copies turned to each axis
 FIELDS_VACUUM = 10  # words a voxel and band: sums of a sweep, fluence of sun, sky and bounces
 FIELDS_MEDIUM = 24  # the same, and coefficients, source, and the iteration's unknowns
+LINKS = 6  # bytes an element and direction
+MOST_LINKS = 1 << 30  # bytes: more are not made
 ELEMENT = 1000  # bytes an element: its rows in each axis's reads, position, material
 
 Shape = tuple[int, int, int]
@@ -31,7 +35,9 @@ def estimate_memory(scene_shape: Shape, bands: int, directions: int, medium: boo
     if elements is None:
         elements = 3 * (nx * ny + ny * nz + nz * nx)
     fields = GEOMETRY + bands * (FIELDS_MEDIUM if medium else FIELDS_VACUUM)
-    return PROGRAM + 4 * (nx + 2) * (ny + 2) * (nz + 2) * fields + elements * (ELEMENT + bands * directions)
+    links = 0 if medium else LINKS * elements * directions
+    links = links if links <= MOST_LINKS else 0
+    return PROGRAM + 4 * (nx + 2) * (ny + 2) * (nz + 2) * fields + elements * (ELEMENT + bands * directions) + links
 
 
 def available_memory() -> int | None:

@@ -35,6 +35,7 @@ from .surfaces import Surfaces, patch_points
 from .texture import Texture, mean_values
 from .transport.characteristic import Inflow, thin_limit
 from .transport.derivative import Manner, swept, unswept
+from .transport.links import Links, find_links, worth_linking
 from .transport.sharded import laps_over, mark_over, plane_size, slopes_over
 from .transport.slopes import THIN
 
@@ -141,6 +142,7 @@ class Transport(eqx.Module):
     factors: Light | None = None  # what leaves is multiplied by, for the exchange of power to balance
     # The medium's albedo times its factors, if light scattered in thick voxels has slopes.
     albedo: Float[Array, "C nx ny nz"] | None = None
+    links: Links | None = None  # in vacuum: the same sums at the elements without a sweep
 
     def __call__(self, leaving: Light, inflow: Inflow | None = None, fluence: bool = True, scattered: bool = False) -> Light:
         """Mean radiance arriving at elements and in voxels, of what leaves them and of what comes in through open sides.
@@ -148,8 +150,10 @@ class Transport(eqx.Module):
         With `scattered` what leaves the voxels is scattered light, which in thick ones is linear; else it is even in each.
         """
         leaving, inflow = _balanced(self.factors, leaving, inflow)
-        albedo = self.albedo if scattered else None
-        sums = _sweep(self, leaving, inflow, fluence, albedo)
+        if self.links is not None and inflow is None and not fluence:
+            sums = Light(self.links.arriving(leaving.elements))
+        else:
+            sums = _sweep(self, leaving, inflow, fluence, self.albedo if scattered else None)
         return _means(sums, Light(self.element_sums, self.voxel_sums))
 
     def transposed(self, asked: Light, scattered: bool = False) -> Light:
@@ -196,9 +200,13 @@ def _balance(transport: Transport, area: Float[Array, " E"]) -> Transport:
     for beyond in _ROUNDS_IN_VACUUM if extinction is None else _ROUNDS_IN_MEDIUM:
         sent = _transposed(transport, jax.tree.map(_ratio, power, sums))
         factors = jax.tree.map(partial(_factor, beyond), factors, power, sent)
-        swept = _furnace(transport, factors)
-        sums = Light(swept.elements, None if power.voxels is None else swept.voxels)
-    return dataclasses.replace(transport, element_sums=swept.elements, voxel_sums=swept.voxels, factors=factors)
+        if transport.links is not None:
+            sums = Light(transport.links.arriving(factors.elements))
+        else:
+            sums = _furnace(transport, factors)
+            sums = sums if extinction is not None else Light(sums.elements)
+    sums = _furnace(transport, factors) if extinction is None else sums
+    return dataclasses.replace(transport, element_sums=sums.elements, voxel_sums=sums.voxels, factors=factors)
 
 
 @jax.jit
@@ -208,6 +216,8 @@ def _factor(beyond: float, factor: Array, wanted: Array, sent: Array) -> Array:
 
 
 def _transposed(transport: Transport, asked: Light, albedo=None) -> Light:
+    if transport.links is not None and asked.voxels is None:
+        return Light(transport.links.sent(asked.elements))
     manner = Manner(transport.thin, transport.onward)
     known = manner, transport.layout, transport.ordinates, transport.extinction
     exitance, source, slopes = unswept(*known, asked.elements, asked.voxels, albedo is not None)
@@ -306,6 +316,8 @@ def _make_transport(
     assert sums.voxels is not None
     fields = {"element_sums": sums.elements, "voxel_sums": sums.voxels, "coverage": sums.voxels[0]}
     transport = dataclasses.replace(transport, **fields)
+    if area is not None and extinction is None and isinstance(layout, Layout) and worth_linking(layout, len(quadrature)):
+        transport = dataclasses.replace(transport, links=find_links(layout, ordinates))
     if area is not None:
         transport = _balance(transport, jnp.asarray(area, layout.plane.dtype))
     if thick and albedo is not None:

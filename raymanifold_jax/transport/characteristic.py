@@ -517,6 +517,7 @@ class _TileRead(NamedTuple):
     """One tile of elements that read voxels of a plane: which voxels, and what they read as a function of the light there."""
 
     cell: Int[Array, " T"]
+    of_each: Callable  # (rays before each of three segments [D, C, T], voxels) -> by direction [D, C, T]
     value: Callable  # (rays before each of three segments [D, C, T], (exitance, source) [C, T]) -> [C, T]
 
 
@@ -529,13 +530,15 @@ def _read_tile(tile, reads: Reads, bits, own: Ordinates, chords: Chords, plane: 
     weight = own.weight[:, None] * jnp.maximum(-_along(own.direction, face), 0.0) * chosen
     voxels = plane.cells(cell)
 
+    def of_each(radiance, here):
+        return weight[:, None] * mean_of(radiance, here, face, chords, length[:, None, None])
+
     def value(radiance, sent):
         # Gathered once, not anew for every use; and summed as a product with ones: XLA vectorises neither otherwise.
-        radiance, here = lax.optimization_barrier((radiance, voxels.sending(sent)))
-        mean = mean_of(radiance, here, face, chords, length[:, None, None])
-        return jnp.tensordot(jnp.ones_like(own.weight), weight[:, None] * mean, 1)
+        light = lax.optimization_barrier((radiance, voxels.sending(sent)))
+        return jnp.tensordot(jnp.ones_like(own.weight), of_each(*light), 1)
 
-    return _TileRead(cell, value)
+    return _TileRead(cell, of_each, value)
 
 
 def _read(sums, plane_number, reads: Reads, bits, own: Ordinates, starts, chords: Chords, plane: _Fields, length, mean_of):

@@ -27,7 +27,9 @@ from ..adjoint import with_adjoint
 from ..layout import Layout, Ordinates
 from ..partition import Partition
 from .characteristic import Inflow, SweptMedium
+from .cores import sum_over_cores
 from .sharded import adjoint_over, sweep_over
+from .transpose import Adjoint
 
 Field = Float[Array, "C nx ny nz"]
 Slopes = tuple[Float[Array, "C X Y Z"], ...]
@@ -177,17 +179,29 @@ def _medium(manner: Manner, layout: Layout | Partition, extinction, source, slop
     return SweptMedium(extinction, source, manner.thin, slopes, manner.onward)
 
 
+def _sweep(manner: Manner, *arguments) -> Results:
+    return sum_over_cores(_sweep_program, (manner,), *arguments)
+
+
+def _unsweep(manner: Manner, sloped: bool, *arguments) -> Sent:
+    return sum_over_cores(_unsweep_program, (manner, sloped), *arguments)
+
+
+def _adjoint(manner: Manner, whole: bool, *arguments) -> Adjoint:
+    return sum_over_cores(_adjoint_program, (manner, whole), *arguments)
+
+
 # Programs of their own: furnaces, bounces and first flights of one shape share them.
 
 
 @eqx.filter_jit
-def _sweep(manner: Manner, layout, ordinates, extinction, exitance, source, slopes, inflow) -> Results:
+def _sweep_program(manner: Manner, layout, ordinates, extinction, exitance, source, slopes, inflow) -> Results:
     medium = _medium(manner, layout, extinction, source, slopes, exitance)
     return sweep_over(layout, ordinates, exitance, medium, inflow, manner.fluence)
 
 
 @eqx.filter_jit
-def _unsweep(manner: Manner, sloped: bool, layout, ordinates, extinction, at_elements, in_voxels) -> Sent:
+def _unsweep_program(manner: Manner, sloped: bool, layout, ordinates, extinction, at_elements, in_voxels) -> Sent:
     dark = jnp.zeros((at_elements.shape[0], *layout.padded), at_elements.dtype)
     medium = _medium(manner, layout, extinction, None, (dark,) * 3 if sloped else None, at_elements)
     found = adjoint_over(layout, ordinates, at_elements, in_voxels, None, medium)
@@ -195,7 +209,7 @@ def _unsweep(manner: Manner, sloped: bool, layout, ordinates, extinction, at_ele
 
 
 @eqx.filter_jit
-def _adjoint(manner: Manner, whole: bool, layout, ordinates, extinction, weights: Results, sent: Sent, inflow):
+def _adjoint_program(manner: Manner, whole: bool, layout, ordinates, extinction, weights: Results, sent: Sent, inflow):
     exitance, source, slopes = sent
     medium = _medium(manner, layout, extinction, source, slopes, weights[0])
     return adjoint_over(layout, ordinates, *weights, exitance if whole else None, medium, inflow)
