@@ -64,6 +64,7 @@ _MODULE_OF = {
     "OrthographicCamera": "camera",
     "PerspectiveCamera": "camera",
     "render": "render",
+    "render_layers": "render",
 }
 _SUBMODULES = ("io", "quadrature", "scenes", "spectra")
 
@@ -94,6 +95,7 @@ if TYPE_CHECKING:
     from raymanifold_jax.mesh import MeshReport as MeshReport
     from raymanifold_jax.optimistix_solver import OptimistixFixedPoint as OptimistixFixedPoint
     from raymanifold_jax.render import render as render
+    from raymanifold_jax.render import render_layers as render_layers
     from raymanifold_jax.scene import MIRROR as MIRROR
     from raymanifold_jax.scene import OPEN as OPEN
     from raymanifold_jax.scene import PERIODIC as PERIODIC

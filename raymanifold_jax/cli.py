@@ -93,6 +93,7 @@ def main() -> None:
     help=f"Of the PNG: stops, or auto, which takes the {_BRIGHT_SHARE:g}th percentile to {_BRIGHT} of white (linear).",
 )
 @click.option("--half", is_flag=True, help="Store 16-bit floats.")
+@click.option("--layers", is_flag=True, help="Depth, normals, albedo and irradiance as layers of the OpenEXR file.")
 @with_options(solve_options)
 @click.pass_context
 def render(
@@ -106,9 +107,10 @@ def render(
     samples: int,
     exposure: float | None,
     half: bool,
+    layers: bool,
     **settings: Any,
 ) -> None:
-    """Solve SCENE (ring, three-balls, room or a file.toml) and write pictures of it."""
+    """Solve SCENE (ring, three-balls, room, cornell-box or a file.toml) and write pictures of it."""
     if (camera is not None) + all_views + (turntable is not None) > 1:
         raise click.UsageError("--camera, --all-views and --turntable exclude each other; leave all but one out", ctx)
     if camera is not None and camera not in scene.views:
@@ -133,15 +135,20 @@ def render(
 
         began = time.perf_counter()
         pictures = {view: rm.render(solution, views[view], samples=samples) for view in files}
+        more = {view: rm.render_layers(solution, views[view]) if layers else {} for view in files}
         render_seconds = time.perf_counter() - began
+        seen = {view: _visible(scene, picture) for view, picture in pictures.items()}
         # One exposure for all views, so that they can be compared.
-        stops = _auto_exposure(pictures.values()) if exposure is None else exposure
+        stops = _auto_exposure(seen.values()) if exposure is None else exposure
         for view, file in files.items():
             header = {"camera": view, "samples": samples, "exposure": stops}
             header |= _header(scene, size, solution, settings["directions"], settings["rtol"])
             attributes = {f"raymanifold.{key}": value for key, value in header.items()}
-            rm.io.write_exr(file, pictures[view], attributes=attributes, half=half)
-            rm.io.write_png(file.with_suffix(".png"), pictures[view], exposure=stops)
+            if scene.bands is None:
+                rm.io.write_exr(file, pictures[view], attributes=attributes, half=half, layers=more[view])
+            else:
+                rm.spectra.write_spectral_exr(file, pictures[view], scene.bands, scene.white, more[view], attributes, half)
+            rm.io.write_png(file.with_suffix(".png"), seen[view], exposure=stops)
     if not settings["quiet"]:
         _report(scene, solution, {"solve": seconds, "render": render_seconds})
         kind = "auto" if exposure is None else "given"
@@ -156,7 +163,7 @@ def render(
 @with_options(solve_options)
 @click.pass_context
 def solve(ctx: click.Context, scene: "SceneEntry", **settings: Any) -> None:
-    """Solve SCENE (ring, three-balls, room or a file.toml) and print where its light goes."""
+    """Solve SCENE (ring, three-balls, room, cornell-box or a file.toml) and print where its light goes."""
     with one_line_errors():
         _start(settings["pe"])
         built = _build(scene, settings["size"] or scene.default_size, settings["directions"])
@@ -318,6 +325,11 @@ def _solve(
     if save is not None:
         solution.save(save)
     return solution, time.perf_counter() - began
+
+
+def _visible(entry: "SceneEntry", picture: "np.ndarray") -> "np.ndarray":
+    """A picture in bands of wavelength as linear sRGB; others as they are."""
+    return picture if entry.bands is None else entry.bands.to_rgb(picture, entry.white)
 
 
 def _header(entry: "SceneEntry", size: int, solution: "Solution", directions: int, rtol: float) -> dict[str, Any]:

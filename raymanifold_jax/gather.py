@@ -236,13 +236,18 @@ def _light_field(solution: Solution) -> LightField:
 
 def surface_radiance(field: LightField, hit: Hit) -> Float[Array, "n C"]:
     """Radiance that leaves the surfaces at hits, in every direction; 0 where there is none."""
+    arriving, albedo = surface_light(field, hit)
+    return albedo / jnp.pi * arriving + jnp.where((hit.material >= 0)[:, None], field.emission[hit.material], 0.0)
+
+
+def surface_light(field: LightField, hit: Hit) -> tuple[Float[Array, "n C"], Float[Array, "n C"]]:
+    """Irradiance and albedo of the surfaces at hits; 0 where there is none."""
     scene = field.scene
     u = to_voxel(scene, hit.point)
     arriving = interpolate_irradiance(scene, field.table, field.irradiance, field.slope, u, hit.normal)
     arriving = arriving + _sun_irradiance(scene, hit.point + _OFF * scene.lattice.spacing * hit.normal, hit.normal)
-    material = jnp.maximum(hit.material, 0)
-    leaving = _albedo(field, material, hit.point) / jnp.pi * arriving + field.emission[material]
-    return jnp.where((hit.material >= 0)[:, None], leaving, 0.0)
+    there = (hit.material >= 0)[:, None]
+    return jnp.where(there, arriving, 0.0), jnp.where(there, _albedo(field, jnp.maximum(hit.material, 0), hit.point), 0.0)
 
 
 def _albedo(field: LightField, material: Array, points: Array) -> Float[Array, "n C"]:

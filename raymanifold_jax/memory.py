@@ -5,8 +5,7 @@ The need in bytes, with V voxels (a layer of ghosts included), C bands, E surfac
     need = PROGRAM + 4 V (GEOMETRY + C FIELDS) + E (ELEMENT + C D) + links
 
 C D: the bits that say which directions hit an element. Without a medium there are also links from element to element (see
-`transport.links`), if they do not exceed MOST_LINKS: 8 bytes each, of which 0.75 D an element. The constants are for 32-bit
-numbers.
+`transport.links`), LINKS E D, if these are not more than MOST_LINKS. The constants are for 32-bit numbers.
 
 Public names: `estimate_memory`, `available_memory`, `check_memory`, `gigabytes`.
 """
@@ -18,7 +17,7 @@ PROGRAM = 1_000_000_000  # Python, JAX, compilation, and the work arrays of a ba
 GEOMETRY = 20  # words a voxel: planes, the samples of the signed distance, copies turned to each axis
 FIELDS_VACUUM = 10  # words a voxel and band: sums of a sweep, fluence of sun, sky and bounces
 FIELDS_MEDIUM = 24  # the same, and coefficients, source, and the iteration's unknowns
-LINKS = 6  # bytes an element and direction
+LINKS = 13  # bytes an element and direction, of which half fall on it
 MOST_LINKS = 1 << 30  # bytes: more are not made
 ELEMENT = 1000  # bytes an element: its rows in each axis's reads, position, material
 

@@ -1,16 +1,19 @@
 """Ready-made scenes, and the cameras that show them.
 
-All fill the unit cube, z up, with n voxels a side:
+These fill the unit cube, z up, with n voxels a side:
 
 - `ring`: a ring in an open box under sky and sun, vacuum (Langer, Breton & Zucker 1995, figure 4);
 - `three_balls_in_fog`: three balls in an open box filled with fog, under the sun (figure 5);
 - `room`: a closed room with a block, lit by a square in its ceiling.
 
+`cornell_box` has its own size, in metres (see its module).
+
 `SCENES` lists them by name, with a size to start from and their views; `cameras` makes a scene's views at a resolution,
 `turntable` views of any scene from all around.
 Walls are seen from inside only, so a camera outside looks through the wall in front of it.
 
-Public names: `ring`, `three_balls_in_fog`, `room`, `SCENES`, `SceneEntry`, `find`, `cameras`, `turntable`, `STANDARD_VIEWS`.
+Public names: `ring`, `three_balls_in_fog`, `room`, `cornell_box`, `SCENES`, `SceneEntry`, `find`, `cameras`, `turntable`,
+`STANDARD_VIEWS`.
 """
 
 import difflib
@@ -19,13 +22,15 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from types import MappingProxyType
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 from . import checks
 from .camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, Vector
+from .cornell_box import camera_frame, cornell_box, default_bands, light_values
 from .lattice import Lattice
 from .scene import OPEN, Boundary, Medium, Scene, Sky, Solid, Sun, Wall
 from .shapes import Box, Sphere, Torus
+from .spectra import Bands
 
 Resolution: TypeAlias = tuple[int, int]
 View: TypeAlias = Callable[[Lattice, Resolution], AbstractCamera]
@@ -92,13 +97,18 @@ def room(n: int = 64, black_light: bool = False) -> Scene:
 
 @dataclass(frozen=True)
 class SceneEntry:
-    """A scene that has a name: `build(n)` makes it with n voxels a side, `views` are its cameras, the default first."""
+    """A scene that has a name: `build(n)` makes it with n voxels a side, `views` are its cameras, the default first.
+
+    `bands` are those of its wavelengths, if it has any, and `white` the band values that pictures show as white.
+    """
 
     name: str
     build: Callable[[int], Scene]
     description: str
     default_size: int
     views: Mapping[str, View] = field(repr=False)
+    bands: Bands | None = None
+    white: Any = field(default=None, repr=False)
 
 
 def find(name: str) -> SceneEntry:
@@ -197,6 +207,11 @@ def _front(
     return PerspectiveCamera(position, target, field_of_view=height, resolution=resolution)
 
 
+def _published(lattice: Lattice, resolution: Resolution) -> PerspectiveCamera:
+    position, target, view = camera_frame()
+    return _front(position, target, view, lattice, resolution)
+
+
 _FROM_FOUR_SIDES: dict[str, View] = {
     side: partial(_oblique, azimuth, 50.0)
     for side, azimuth in {"south": -90.0, "east": 0.0, "north": 90.0, "west": 180.0}.items()
@@ -231,6 +246,15 @@ SCENES: Mapping[str, SceneEntry] = MappingProxyType(
                 64,
                 # From below the ceiling: on it, the eye would touch the light.
                 {"front": partial(_front, (0.5, -1.75, 0.5), (0.5, 0.5, 0.5), 34.0), "top": partial(_top, depth=1e-3)},
+            ),
+            SceneEntry(
+                "cornell-box",
+                cornell_box,
+                "the Cornell box with its published spectra, in 8 bands from 400 to 700 nm",
+                64,
+                {"front": _published},
+                default_bands(),
+                light_values(default_bands()),
             ),
         )
     }

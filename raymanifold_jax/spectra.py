@@ -159,6 +159,7 @@ def write_spectral_exr(
     white: Any = None,
     layers: Mapping[str, Any] | None = None,
     attributes: Mapping[str, str | float | int] | None = None,
+    half: bool = False,
 ) -> None:
     """Write radiance in bands as OpenEXR that other programs open: an RGB preview, the bands, and further layers.
 
@@ -168,29 +169,18 @@ def write_spectral_exr(
 
     **Raises** what `write_exr` raises, and `ValueError` for sizes that differ.
     """
-    from .io.exr import checked_image, write_exr
+    from .io.exr import checked_image, with_layers, write_exr
 
     picture = checked_image(image)
-    parts = [bands.to_rgb(picture, white), picture]
-    names = ["R", "G", "B", *(f"S0.{_comma(w)}nm" for w in bands.centres)]
-    for layer, values in (layers or {}).items():
-        plane = checked_image(values)
-        if plane.shape[:2] != picture.shape[:2]:
-            checks.fail(
-                f"layers[{layer!r}]", f"shape {plane.shape}", f"{picture.shape[:2]} pixels", "render it at the same size"
-            )
-        kinds = {1: ["Z"], 3: list("XYZ" if layer in ("normal", "position") else "RGB")}
-        kinds.setdefault(len(bands), [f"{_comma(w)}nm" for w in bands.centres])
-        if plane.shape[2] not in kinds:
-            checks.fail(f"layers[{layer!r}]", f"{plane.shape[2]} channels", f"1, 3 or {len(bands)}", "split it")
-        parts.append(plane)
-        names += [f"{layer}.{kind}" for kind in kinds[plane.shape[2]]]
+    wavelengths = [f"{_comma(w)}nm" for w in bands.centres]
+    planes = np.concatenate([bands.to_rgb(picture, white), picture], -1)
+    planes, names = with_layers(planes, ["R", "G", "B", *(f"S0.{w}" for w in wavelengths)], layers or {}, wavelengths)
     header = {
         "spectralLayoutVersion": "1.0",
         "emissiveUnits": "W.m^-2.sr^-1",
         "raymanifold.bands": " ".join(f"{edge:g}" for edge in bands.edges),
     }
-    write_exr(path, np.concatenate(parts, -1), names, {**header, **(attributes or {})})
+    write_exr(path, planes, names, {**header, **(attributes or {})}, half)
 
 
 def _comma(wavelength: float) -> str:

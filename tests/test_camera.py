@@ -4,6 +4,7 @@ import jax
 import numpy as np
 import pytest
 
+import raymanifold_jax as rm
 from raymanifold_jax.camera import OrthographicCamera, PerspectiveCamera
 from raymanifold_jax.lattice import Lattice
 
@@ -124,3 +125,23 @@ def test_bad_rows(rows):
 def test_bad_samples(samples, error):
     with pytest.raises(error, match="samples"):
         perspective.rays(samples)
+
+
+def test_layers_of_a_ball():
+    """Depth, normal and albedo of a ball seen along y are those of the sphere; 0 where the ray goes through an open side."""
+    ball, wall = rm.Solid(rm.Sphere((4, 4, 4), 2.5), albedo=0.3), rm.Wall(0.8)
+    scene = rm.Scene(rm.Lattice((8, 8, 8)), [ball], lights=[rm.Sky(1.0)], boundary=rm.Boundary(wall, rm.OPEN, wall))
+    solution = rm.solve(scene, rm.quadrature.fibonacci(40), progress=False)
+    camera = rm.OrthographicCamera((4, -3, 4), (0, 1, 0), (0, 0, 1), width=8, resolution=(16, 16))
+    layers = rm.render_layers(solution, camera)
+    x, z = np.meshgrid((np.arange(16) + 0.5) / 2 - 4, 4 - (np.arange(16) + 0.5) / 2)
+    on = np.hypot(x, z) < 2.4
+    y = -np.sqrt(np.maximum(2.5**2 - x**2 - z**2, 0))
+    np.testing.assert_allclose(layers["depth"][on], (7 + y)[on], atol=2e-3)
+    np.testing.assert_allclose(layers["normal"][on], np.stack([x, y, z], -1)[on] / 2.5, atol=5e-3)
+    np.testing.assert_allclose(layers["albedo"][on], 0.3, rtol=1e-6)
+    off = np.hypot(x, z) > 2.6
+    assert all(np.all(layers[name][off] == 0) for name in layers)
+    # Of the light that leaves, without a medium, irradiance tells all.
+    picture = rm.render(solution, camera, 1)
+    np.testing.assert_allclose(picture[on], (0.3 / np.pi * layers["irradiance"])[on], rtol=1e-5)

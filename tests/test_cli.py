@@ -281,3 +281,19 @@ def test_a_real_picture(tmp_path):
     assert (tmp_path / "x.png").is_file()
     # Fog fills the middle of the picture; its corners lie outside the box, where nothing shines.
     assert image[16, 16, 0] > 0 and image[0, 0, 0] == 0
+
+
+def test_layers_and_bands_of_wavelength(tmp_path):
+    """The Cornell box, small: an RGB preview, its bands and the layers in one file, and a picture in colour."""
+    out = tmp_path / "box.exr"
+    arguments = ["render", "cornell-box", "--size", "4", "--directions", "24", "--resolution", "8", "--samples", "1"]
+    done = CliRunner().invoke(cli.main, [*arguments, "--layers", "--quiet", "--out", str(out)])
+    assert done.exit_code == 0, done.output
+    image, names, header = rm.io.read_exr(out)
+    bands = [name for name in names if name.startswith("S0.")]
+    assert image.shape == (8, 8, len(names)) and len(bands) == 8 and names[:3] == ["R", "G", "B"]
+    assert {"depth.Z", "normal.X", "normal.Y", "normal.Z"} <= set(names) and header["raymanifold.scene"] == "cornell-box"
+    assert sum(name.startswith("albedo.") for name in names) == sum(name.startswith("irradiance.") for name in names) == 8
+    assert image[..., names.index("depth.Z")].max() > 0.8  # metres: the eye is that far in front of the box
+    with Image.open(out.with_suffix(".png")) as png:
+        assert png.mode == "RGB"

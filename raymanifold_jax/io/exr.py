@@ -1,6 +1,7 @@
 """OpenEXR pictures: linear radiance, one channel a band, with the run's settings in the header.
 
-Public names: `write_exr`, `read_exr`. `checked_image` and `written_atomically` serve the other formats too.
+Public names: `write_exr`, `read_exr`. `checked_image`, `with_layers` and `written_atomically` serve the
+other formats too.
 """
 
 import os
@@ -30,6 +31,7 @@ def write_exr(
     channels: Sequence[str] | None = None,
     attributes: Mapping[str, str | float | int] | None = None,
     half: bool = False,
+    layers: Mapping[str, ArrayLike] | None = None,
 ) -> None:
     """Write a picture as OpenEXR. The file appears whole, or the old one stays.
 
@@ -40,6 +42,8 @@ def write_exr(
     - `channels`: one name a channel. Left out, one channel is "Y" and three are "R", "G", "B".
     - `attributes`: entries for the header. Integers are stored with 32 bits, floats in single precision.
     - `half`: store 16-bit floats (11 bits of mantissa, up to 65504) where the default is 32-bit ones.
+    - `layers`: further pictures of the same size by name, such as what `rm.render_layers` gives: channels "depth.Z",
+      "normal.X", "albedo.R", or "albedo.NAME" for the NAME of each of the image's own channels.
 
     **Raises:** `ValueError` for an image that is not finite, has the wrong number of dimensions or exceeds the format's
     range, for missing or repeated channel names, and for attributes the header cannot hold; `TypeError` for values that
@@ -47,6 +51,7 @@ def write_exr(
     """
     picture = checked_image(image)
     names = _channel_names(picture.shape[2], channels)
+    picture, names = with_layers(picture, names, layers or {}, names)
     header = _header(attributes or {})
     dtype = np.float16 if half else np.float32
     largest, limit = float(np.abs(picture).max()), float(np.finfo(dtype).max)
@@ -114,6 +119,25 @@ def checked_image(image: ArrayLike) -> Float[np.ndarray, "height width channels"
         advice = "index one picture out of a stack, as in images[0]"
         checks.fail("image", f"shape {picture.shape}", "(height, width) or (height, width, channels), none 0", advice)
     return np.asarray(checks.finite("image", picture)).reshape(*picture.shape[:2], -1)
+
+
+def with_layers(
+    picture: Float[np.ndarray, "height width channels"], names: list[str], layers: Mapping[str, ArrayLike], bands: Sequence[str]
+) -> tuple[Float[np.ndarray, "height width more"], list[str]]:
+    """The picture and its channels' names with those of `layers`; layers with one channel a band are named by `bands`."""
+    parts, all_names = [picture], list(names)
+    for layer, values in layers.items():
+        plane = checked_image(values)
+        if plane.shape[:2] != picture.shape[:2]:
+            got, expected = f"shape {plane.shape}", f"{picture.shape[:2]} pixels"
+            checks.fail(f"layers[{layer!r}]", got, expected, "render it at the same size")
+        kinds = {len(bands): list(bands), 1: ["Z" if layer == "depth" else "Y"]}
+        kinds[3] = list("XYZ") if layer in ("normal", "position") else kinds.get(3, ["R", "G", "B"])
+        if plane.shape[2] not in kinds:
+            checks.fail(f"layers[{layer!r}]", f"{plane.shape[2]} channels", f"1, 3 or {len(bands)}", "split it")
+        parts.append(plane)
+        all_names += [f"{layer}.{kind}" for kind in kinds[plane.shape[2]]]
+    return np.concatenate(parts, -1), all_names
 
 
 @contextmanager
