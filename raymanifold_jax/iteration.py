@@ -174,6 +174,8 @@ class Iteration:
         self._more = 0  # sweeps that led to no iterate
         self._tight = math.inf  # a bound on the present iterate's error, better than the factor's
         self._gain = _HOPED  # of polishing, on the bound
+        self.asked = False  # for so many bounces and no more
+        self.before: Light | None = None  # then: the bounced light one bounce earlier, if there was any
 
     def _state(self) -> tuple:
         return self.arriving, self.residual, self.lost, np.array(self.residuals), np.array(self.target)
@@ -267,11 +269,17 @@ class Iteration:
         """Count sweeps that a solver made without telling what they led to."""
         self._more += sweeps
 
+    def cut_short(self) -> None:
+        """Say that what there is at the end is what was asked for."""
+        self.asked = True
+
     @property
     def ending(self) -> str:
-        """How it stands: "" (go on), "converged", "no bound", "diverged", "stagnated" or "sweep limit"."""
+        """How it stands: "" (go on), "converged", "no bound", "diverged", "stagnated", "sweep limit" or "as asked"."""
         if self.converged:
             return "converged"
+        if self.asked:
+            return "as asked"
         if not self.residuals[-1] <= _GROWN * self.residuals[0]:
             return "diverged"
         # Without a bound the residual alone must do: as small as for a factor of 1000.

@@ -74,8 +74,9 @@ class Solution(eqx.Module):
     - `error_bound`: certified: no radiosity, and no medium source times pi, is further than this from the exact solution of
       the discrete problem (in radiosity units; rounding apart). inf where no bound is known, nan under `jit` and `vmap`.
     - `sweeps`: applications of the transport operator on the full lattice. `history`: the largest residual after each
-      sweep, in radiosity units. `ending`: "converged", "sweep limit", "stagnated", "diverged" or "no bound"; `result`: the same
-      in a sentence, with advice; `converged`: whether the bound met the tolerance; `solver`: which one it was.
+      sweep, in radiosity units. `ending`: "converged", "sweep limit", "stagnated", "diverged", "no bound" or, with `bounces`,
+      "as asked"; `result`: the same in a sentence, with advice; `converged`: whether the bound met the tolerance; `solver`:
+      which one it was.
     - `rounding`: what the float type's rounding in the sweeps may add to the error, in radiosity units; an estimate.
     - `no_bound`: why there is no error bound; empty where there is one.
     - `diffuse_*` and `sun_*`: (bands, ...), the light of the suns' direct beams, and all other light.
@@ -163,6 +164,8 @@ class Solution(eqx.Module):
             text = f"converged: error bound {bound:.3g} is within the target {target:.3g} after {count} sweeps ({self.solver})"
             rounding = f"; rounding may add up to {self.rounding:.3g}: enable float64 if that matters"
             return text + rounding * (self.rounding > target)
+        if self.ending == "as asked":
+            return f"{self.solver}, as asked: all the light differs from it by {bound:.3g} at most"
         ending = {
             "no bound": f"no error bound: {self.no_bound}; lower an albedo below 1, or open a side",
             "stagnated": "stagnated at the float type's rounding; raise rtol, or enable float64",

@@ -35,7 +35,7 @@ from .quadrature import Quadrature, for_scene
 from .scene import OPEN, PointLight, Scene, Sky, Sun
 from .sharding import check_mesh
 from .solution import Energy, Solution, _Hidden
-from .solvers import Anderson, Jacobi, Krylov, automatic
+from .solvers import Anderson, Jacobi, Krylov, Orders, automatic
 from .source_checks import check_sources
 from .surfaces import Surfaces
 from .transport.characteristic import Characteristic
@@ -55,6 +55,7 @@ def solve(
     mesh: Mesh | None = None,
     checkpoint: Checkpoint | None = None,
     prepared: Prepared | None = None,
+    bounces: int | None = None,
 ) -> Solution:
     """Solve a scene for the light everywhere.
 
@@ -78,6 +79,9 @@ def solve(
     - `checkpoint`: an `rm.Checkpoint`, in which the iteration keeps its state, and from which it may go on.
     - `prepared`: what `prepare(scene)` gave for a scene of the same shapes, lattice and kinds of sides, to save time; pass
       the same `quadrature` each time as well.
+    - `bounces`: only light that surfaces and medium have sent on at most so many times before it arrives; `None`: all of it.
+      With 0 it comes straight from the sources, and pictures show what surfaces and fog send on once: single scattering. The
+      bound then tells how far that is from all the light. `solver` has no say.
     - `mesh`: `rm.pe_array(nu, nv)` splits the lattice over devices (see `partition`). Results are the same to rounding. What
       needs no sweep is done on one device: the geometry, light straight from point lights and small emitters, readings of
       the solution. Not with the paper's scheme, nor under `jit` and `vmap`.
@@ -87,6 +91,7 @@ def solve(
     with `throw`.
     """
     _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint, prepared)
+    chosen = solver if bounces is None else _orders(bounces, scene, checkpoint)
     cube = scheme if isinstance(scheme, LightRayCube) else None
     quadrature = for_scene(scene) if quadrature is None else quadrature
     check_memory(scene.lattice.shape, scene.bands, len(quadrature), scene.medium is not None)
@@ -115,11 +120,11 @@ def solve(
             key = (id(quadrature), scene.bands, area is None, mesh)
             transport = prepared.transport(key, (stuff.extinction, stuff.scattering_albedo), make, quadrature)
             system = System(transport, own, first_flight(scene, surfaces, transport, quadrature, own, prepared))
-        iteration, solver = _iterate(
-            system, surfaces if nodes is None else None, float(rtol), solver, max_sweeps, meter, checkpoint
+        iteration, chosen = _iterate(
+            system, surfaces if nodes is None else None, float(rtol), chosen, max_sweeps, meter, checkpoint
         )
-        solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes, solver)
-    if throw and not solution.converged:
+        solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes, chosen)
+    if throw and not solution.converged and solution.ending != "as asked":
         raise RuntimeError(f"solve: {solution.result}")
     return solution
 
@@ -147,6 +152,15 @@ def _iterate(
         iteration.system = dataclasses.replace(system, near=near)
         iteration.arriving = attach(iteration.system, iteration.arriving, rtol, most)
     return iteration, solver
+
+
+def _orders(bounces: int, scene: Scene, checkpoint: Checkpoint | None) -> Orders:
+    bounces = checks.positive_int("bounces", bounces, at_least=0)
+    if checks.is_traced(scene):
+        checks.fail("bounces", f"{bounces} under JAX's transformations", "None", "derivatives are of all light", TypeError)
+    if checkpoint is not None:
+        checks.fail("checkpoint", f"one with bounces={bounces}", "None", "so few sweeps need none")
+    return Orders(bounces)
 
 
 def _depth(stuff: Materials, spacing: float) -> float:
@@ -238,7 +252,10 @@ def _finish(
     # Within its bound a Krylov iterate may dip below 0, where the exact solution is not.
     bounced = jax.tree.map(lambda x: x + lax.stop_gradient(jnp.maximum(-x, 0.0)), bounced)
     if not system.scatters:  # the iteration did not need the light in the voxels
-        everywhere = system.transport(system.materials.reflected(system.source + bounced), fluence=True)
+        before = iteration.before if isinstance(iteration, Iteration) and iteration.asked else bounced
+        everywhere = jax.tree.map(jnp.zeros_like, system.source)
+        if before is not None:
+            everywhere = system.transport(system.materials.reflected(system.source + before), fluence=True)
         bounced = Light(bounced.elements, everywhere.voxels)
     rest, sun = system.direct.rest + bounced, system.direct.sun
     if nodes is not None:

@@ -42,6 +42,19 @@ class Jacobi(eqx.Module):
             iteration.keep()
 
 
+class Orders(eqx.Module):
+    """The first `count` orders of bounces, and no more: what `solve(bounces=count)` runs."""
+
+    count: int = eqx.field(static=True)
+
+    def run(self, iteration: Iteration) -> None:
+        iteration.cut_short()
+        for _ in range(self.count):
+            order, residual = iteration.system.bounce(iteration.residual)
+            iteration.before = iteration.arriving
+            iteration.reach(iteration.arriving + order, residual)
+
+
 @eqx.filter_jit
 def _add(total: Light, lost: Light, order: Light) -> tuple[Light, Light]:
     """Kahan's sum: `lost` holds the low bits."""

@@ -157,3 +157,31 @@ def test_a_medium_without_end(x64):
 def test_derivative_of_a_medium_without_end(x64):
     slope = jax.grad(lambda absorption: _without_end(absorption).fluence[1, 1, 1])(0.5)
     np.testing.assert_allclose(slope, -32 * np.pi, rtol=1e-6)
+
+
+@pytest.mark.parametrize("medium", [None, rm.Medium(0.3, 0.1)])
+def test_orders_of_bounces_add_up(x64, medium):
+    """k bounces are k of Jacobi's sweeps, many are all the light; the bound tells what is missing."""
+    scene = rm.Scene(problems.cube(6), [], medium, [rm.Sun((0.2, 0.3, -1))], problems.walls(0.5, 0.0, rm.OPEN))
+    run = lambda **options: rm.solve(scene, rm.quadrature.fibonacci(48), progress=False, **options)
+    whole = run(rtol=1e-10)
+    for count in (0, 1, 3):
+        some = run(bounces=count)
+        assert some.ending == "as asked" and "as asked" in some.result
+        gap = np.abs(whole.surfaces.radiosity - some.surfaces.radiosity).max()
+        assert 0 < gap <= some.error_bound * (1 + 1e-9)
+        if count:
+            jacobi = run(solver=rm.Jacobi(), max_sweeps=count)
+            np.testing.assert_allclose(some.surfaces.irradiance, jacobi.surfaces.irradiance, rtol=1e-12)
+    np.testing.assert_allclose(run(bounces=0).diffuse_fluence, 0, atol=1e-15)
+    for name in ("diffuse_irradiance", "diffuse_fluence"):
+        np.testing.assert_allclose(getattr(run(bounces=40), name), getattr(whole, name), rtol=1e-8)
+    assert run(bounces=2, throw=True).sweeps >= 2
+
+
+def test_bad_bounces():
+    scene = rm.Scene(problems.cube(4), boundary=problems.walls(0.5, 1.0))
+    with pytest.raises(ValueError, match="bounces: got -1"):
+        rm.solve(scene, bounces=-1)
+    with pytest.raises(TypeError, match="bounces: got"):
+        rm.solve(scene, bounces=1.5)
