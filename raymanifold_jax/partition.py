@@ -76,8 +76,9 @@ class Shapes(eqx.Module):
         return even(self.lattice[axis], self.parts(name), _SLOTS[NAMES.index(name)])
 
     def origin(self, axis: int) -> Int[np.ndarray, " N"]:
-        """The scene's column that each padded one is an image of."""
-        return unfolded(self.scene_shape[axis], self.unfolding.blocks[axis], self.pad[axis])
+        """The scene's column that each padded one is an image of; -1: none."""
+        columns = unfolded(self.scene_shape[axis], self.unfolding.blocks[axis], self.pad[axis])
+        return np.pad(columns, (0, self.lattice[axis] - len(columns)), constant_values=-1)
 
     def stored(self, axis: int) -> Int[np.ndarray, "p s"]:
         return full(self.scene_shape[axis], self.parts(NAMES[axis]))
@@ -85,6 +86,71 @@ class Shapes(eqx.Module):
     @property
     def cubic(self) -> bool:
         return len(set(self.lattice)) == 1 and len(set(self.pad)) == 1
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of stored fields."""
+        x, y = (self.stored(axis).size for axis in (0, 1))
+        return x, y, self.scene_shape[2]
+
+    @property
+    def padded(self) -> tuple[int, int, int]:
+        x, y = (self.split(axis, NAMES[axis]).size for axis in (0, 1))
+        return x, y, self.lattice[2]
+
+    @property
+    def shape_here(self) -> tuple[int, int, int]:
+        """Of a device's part of stored fields."""
+        x, y = (self.stored(axis).shape[1] for axis in (0, 1))
+        return x, y, self.scene_shape[2]
+
+    @property
+    def padded_here(self) -> tuple[int, int, int]:
+        x, y = (self.split(axis, NAMES[axis]).shape[1] for axis in (0, 1))
+        return x, y, self.lattice[2]
+
+    @property
+    def largest_plane(self) -> int:
+        """Voxels of the largest plane of a block."""
+        return max(self.split(u, "u").shape[1] * self.split(v, "v").shape[1] for _, u, v in AXES)
+
+    def to_padded(self, field: Float[Array, "C nx ny nz"]) -> Float[Array, "C X Y Z"]:
+        """A device's part, stored, of its own and other devices' parts, within `shard_map`."""
+        for axis, name in enumerate(NAMES):
+            origin = self.origin(axis)
+            columns = self.split(axis, name)
+            wanted = np.where(columns >= 0, origin[np.maximum(columns, 0)], -1)
+            field = make_moves(name, self.stored(axis), wanted)(field, field.ndim - 3 + axis)
+        return take(field, field.ndim - 1, self.origin(2))
+
+    def from_padded(self, field: Float[Array, "C X Y Z"]) -> Float[Array, "C nx ny nz"]:
+        """Sum over the images: the transpose of `to_padded`."""
+        like = jax.ShapeDtypeStruct((*field.shape[:-3], *self.shape_here), field.dtype)
+        return jax.linear_transpose(self.to_padded, like)(field)[0]
+
+    def turned(self, field: Array, axis: int) -> Array:
+        """All columns of the sweep axis, a block of the others, within `shard_map`; see the module's docstring."""
+        if axis == 2:
+            return field
+        # The first all-to-all splits z over one mesh axis, the second completes the sweep axis over the other.
+        over, then, middle = ("v", "u", 1) if axis == 0 else ("u", "v", 0)
+        lattice, split = self.lattice, self.split
+        x = field.ndim - 3
+        field = take(field, x + 2, split(2, over).ravel())
+        field = _all_to_all(field, over, x + 2, x + middle)
+        place = np.append(positions(split(middle, over)), -1)
+        field = take(field, x + middle, place[split(middle, then).ravel()])
+        field = _all_to_all(field, then, x + middle, x + axis)
+        place = positions(split(axis, then))
+        assert len(place) == lattice[axis]
+        return take(field, x + axis, place)
+
+    def columns(self, axis: int) -> tuple[Array, Array]:
+        """The padded rows and columns of the planes here, within `shard_map`; -1: none."""
+        _, u, v = AXES[axis]
+        return tuple(
+            jnp.asarray(self.split(a, name))[lax.axis_index(name)] for a, name in zip((u, v), NAMES, strict=True)
+        )  # pyright: ignore[reportReturnType]
 
 
 class Uncompared:
@@ -140,18 +206,15 @@ class Partition(_InBlocks):
     @property
     def shape(self) -> tuple[int, int, int]:
         """Of stored fields."""
-        x, y = (self.shapes.stored(axis).size for axis in (0, 1))
-        return x, y, self.shapes.scene_shape[2]
+        return self.shapes.shape
 
     @property
     def padded(self) -> tuple[int, int, int]:
-        x, y = (self.shapes.split(axis, NAMES[axis]).size for axis in (0, 1))
-        return x, y, self.shapes.lattice[2]
+        return self.shapes.padded
 
     @property
     def largest_plane(self) -> int:
-        """Voxels of the largest plane of a block."""
-        return max(self.shapes.split(u, "u").shape[1] * self.shapes.split(v, "v").shape[1] for _, u, v in AXES)
+        return self.shapes.largest_plane
 
     def on_blocks(self, function: Callable, tables: Any, fields: Any, same: Any, out: Any) -> Any:
         """function(block, tables, fields, same) on every device, with its part of each; `out` are the results' specs."""
@@ -197,13 +260,11 @@ class Block(_InBlocks):
 
     @property
     def padded(self) -> tuple[int, int, int]:
-        x, y = (self.shapes.split(axis, NAMES[axis]).shape[1] for axis in (0, 1))
-        return x, y, self.shapes.lattice[2]
+        return self.shapes.padded_here
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        x, y = (self.shapes.stored(axis).shape[1] for axis in (0, 1))
-        return x, y, self.shapes.scene_shape[2]
+        return self.shapes.shape_here
 
     @property
     def cubic(self) -> bool:
@@ -235,24 +296,17 @@ class Block(_InBlocks):
         return self.shapes.lattice[axis], self.shapes.split(u, "u").shape[1], self.shapes.split(v, "v").shape[1]
 
     def to_padded(self, field: Float[Array, "C nx ny nz"]) -> Float[Array, "C X Y Z"]:
-        for axis, name in enumerate(NAMES):
-            origin = self.shapes.origin(axis)
-            columns = self.shapes.split(axis, name)
-            wanted = np.where(columns >= 0, origin[np.maximum(columns, 0)], -1)
-            field = make_moves(name, self.shapes.stored(axis), wanted)(field, field.ndim - 3 + axis)
-        return take(field, field.ndim - 1, self.shapes.origin(2))
+        return self.shapes.to_padded(field)
 
     def from_padded(self, field: Float[Array, "C X Y Z"]) -> Float[Array, "C nx ny nz"]:
-        """Sum over the images: the transpose of `to_padded`."""
-        like = jax.ShapeDtypeStruct((*field.shape[:-3], *self.shape), field.dtype)
-        return jax.linear_transpose(self.to_padded, like)(field)[0]
+        return self.shapes.from_padded(field)
 
     def exitance_field(self, exitance: Float[Array, "C E"]) -> Float[Array, "C X Y Z"]:
         return exitance_in_voxels(exitance, self.source_element, self.share, self.cell, self.padded)
 
     def planes(self, field: Array, axis: int, fill: float = 0) -> Array:
         """A padded field as flat planes along a sweep axis, [K, *C, P]; `fill` in the slots that hold no voxel."""
-        flat = flat_planes(self._turned(field, axis), axis)
+        flat = flat_planes(self.shapes.turned(field, axis), axis)
         return jnp.where(self._empty(axis), jnp.asarray(fill, flat.dtype), flat) if fill else flat
 
     def from_planes(self, planes: Float[Array, "K C P"], axis: int) -> Float[Array, "C X Y Z"]:
@@ -260,44 +314,20 @@ class Block(_InBlocks):
         like = jax.ShapeDtypeStruct((planes.shape[1], *self.padded), planes.dtype)
         return jax.linear_transpose(lambda field: self.planes(field, axis), like)(planes)[0]
 
-    def _turned(self, field: Array, axis: int) -> Array:
-        """All columns of the sweep axis, a block of the others; see the module's docstring."""
-        if axis == 2:
-            return field
-        # The first all-to-all splits z over one mesh axis, the second completes the sweep axis over the other.
-        over, then, middle = ("v", "u", 1) if axis == 0 else ("u", "v", 0)
-        lattice, split = self.shapes.lattice, self.shapes.split
-        x = field.ndim - 3
-        field = take(field, x + 2, split(2, over).ravel())
-        field = _all_to_all(field, over, x + 2, x + middle)
-        place = np.append(positions(split(middle, over)), -1)
-        field = take(field, x + middle, place[split(middle, then).ravel()])
-        field = _all_to_all(field, then, x + middle, x + axis)
-        place = positions(split(axis, then))
-        assert len(place) == lattice[axis]
-        return take(field, x + axis, place)
-
-    def _columns(self, axis: int) -> tuple[Array, Array]:
-        """The padded rows and columns of the planes here; -1: none."""
-        _, u, v = AXES[axis]
-        return tuple(
-            jnp.asarray(self.shapes.split(a, name))[lax.axis_index(name)] for a, name in zip((u, v), NAMES, strict=True)
-        )  # pyright: ignore[reportReturnType]
-
     def _empty(self, axis: int) -> Bool[Array, " P"]:
-        rows, columns = self._columns(axis)
+        rows, columns = self.shapes.columns(axis)
         return ((rows < 0)[:, None] | (columns < 0)).ravel()
 
     def rim(self, axis: int) -> Bool[Array, " P"]:
         """Ghost voxels at the rim of the planes, and empty slots."""
         edges = []
-        for where, a in zip(self._columns(axis), AXES[axis][1:], strict=True):
+        for where, a in zip(self.shapes.columns(axis), AXES[axis][1:], strict=True):
             ends = (where < self.pad[a]) | (where >= self.shapes.lattice[a] - self.pad[a])
             edges.append(ends | (where < 0))
         return (edges[0][:, None] | edges[1]).ravel()
 
     def ring(self, axis: int) -> Ring:
-        rows, columns = self._columns(axis)
+        rows, columns = self.shapes.columns(axis)
         _, height, width = self.padded_along(axis)
         parts = self.shapes.parts("u"), self.shapes.parts("v")
         return Ring(height, width, jnp.sum(rows >= 0), jnp.sum(columns >= 0), parts)

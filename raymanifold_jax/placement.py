@@ -4,6 +4,9 @@ A solve on a mesh prepares geometry and materials on one device (the default one
 the mesh's blocks (`partition`), and hands its solution back on one device. Both ways are linear, each the other's transpose, so
 gradients go through.
 
+Values of surface elements, (C, E), lie on all devices; those of the light-ray-cube scheme's SURFACE nodes, which are many, in
+blocks too.
+
 Public: `stored`, `restored`, `known`, `check_agreement`.
 """
 
@@ -26,23 +29,25 @@ from .adjoint import linear
 from .layout import Layout
 from .partition import Partition, put
 from .sharding import NAMES
+from .transport.ray_layout import RayLattice
+from .transport.ray_partition import LIST, NodeLists, RayPartition
 
 Tree = TypeVar("Tree")
 
 
-def stored(layout: Layout | Partition, tree: Tree) -> Tree:
-    """Arrays of one device as the layout wants them: values of elements (C, E) everywhere, fields of the scene in blocks.
+def stored(layout: Layout | Partition | RayLattice | RayPartition, tree: Tree) -> Tree:
+    """Arrays of one device as the layout wants them: values of elements or nodes (C, E), fields of the scene in blocks.
 
     Without a mesh, everything as it is.
     """
-    if isinstance(layout, Layout):
+    if isinstance(layout, Layout | RayLattice):
         return tree
     return jax.tree.map(lambda a: _moved(layout, a, True), tree)
 
 
-def restored(layout: Layout | Partition, tree: Tree) -> Tree:
+def restored(layout: Layout | Partition | RayLattice | RayPartition, tree: Tree) -> Tree:
     """The inverse of `stored`."""
-    if isinstance(layout, Layout):
+    if isinstance(layout, Layout | RayLattice):
         return tree
     return jax.tree.map(lambda a: _moved(layout, a, False), tree)
 
@@ -69,10 +74,15 @@ def check_agreement(name: str, tree: Any) -> None:
         checks.fail(name, got, "the same in every process", "have all processes make it in the same way, without chance")
 
 
-def _moved(partition: Partition, array: Array, to_mesh: bool) -> Array:
-    size = partition.shape if to_mesh else partition.shapes.scene_shape
-    shape = (*array.shape[:-3], *size) if array.ndim > 2 else array.shape
-    there, back = _Store(partition.shapes.mesh, partition.shape), _Restore(partition.shapes.scene_shape)
+def _moved(partition: Partition | RayPartition, array: Array, to_mesh: bool) -> Array:
+    shapes = partition.shapes
+    lists = partition.lists if isinstance(partition, RayPartition) else None
+    shape = array.shape
+    if array.ndim > 2:
+        shape = (*shape[:-3], *(shapes.shape if to_mesh else shapes.scene_shape))
+    elif lists is not None:
+        shape = (*shape[:-1], lists.size if to_mesh else len(lists.slot))
+    there, back = _Store(shapes.mesh, shapes.shape, lists), _Restore(shapes.scene_shape, lists)
     forward, backward = (there, back) if to_mesh else (back, there)
     if not jnp.issubdtype(array.dtype, jnp.inexact):
         return forward((), [array])[0]
@@ -83,20 +93,29 @@ def _moved(partition: Partition, array: Array, to_mesh: bool) -> Array:
 class _Store:
     mesh: Mesh
     shape: tuple[int, int, int]
+    lists: NodeLists | None
 
     def __call__(self, _: Any, arrays: list[Array]) -> list[Array]:
         (array,) = arrays
-        if array.ndim <= 2:
-            return [put(self.mesh, array, Spec())]
-        behind = [(0, wanted - size) for wanted, size in zip(self.shape, array.shape[-3:], strict=True)]
-        values = np.pad(np.asarray(array), [(0, 0)] * (array.ndim - 3) + behind)
-        return [put(self.mesh, values, Spec(*[None] * (array.ndim - 3), *NAMES))]
+        values = np.asarray(array)
+        if array.ndim > 2:
+            behind = [(0, wanted - size) for wanted, size in zip(self.shape, array.shape[-3:], strict=True)]
+            values = np.pad(values, [(0, 0)] * (array.ndim - 3) + behind)
+            return [put(self.mesh, values, Spec(*[None] * (array.ndim - 3), *NAMES))]
+        if self.lists is None:
+            return [put(self.mesh, values, Spec())]
+        lists = np.zeros((len(values), self.lists.size), values.dtype)
+        lists[:, self.lists.slot] = values
+        return [put(self.mesh, lists, LIST)]
 
 
 @dataclasses.dataclass(frozen=True)
 class _Restore:
     shape: tuple[int, int, int]
+    lists: NodeLists | None
 
     def __call__(self, _: Any, arrays: list[Array]) -> list[Array]:
         values = known(arrays[0])
-        return [jnp.asarray(values[(..., *(slice(n) for n in self.shape))] if values.ndim > 2 else values)]
+        if values.ndim > 2:
+            return [jnp.asarray(values[(..., *(slice(n) for n in self.shape))])]
+        return [jnp.asarray(values if self.lists is None else values[:, self.lists.slot])]

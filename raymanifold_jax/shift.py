@@ -1,7 +1,9 @@
 """Moving rays to the neighbouring voxels: the only communication of a sweep.
 
 On one device that is a local move. Where a plane is split in blocks over the mesh axes `u` and `v` (see `partition`), a block
-gets the rim of its neighbours first, around a ring (the torus of the paper's machine).
+gets the rim of its neighbours first, around a ring (the torus of the paper's machine). Rays of the light ray cube, which move by
+up to M nodes at once, get a halo of M; where blocks are narrower than that it comes in several steps, each from one block to
+the next.
 """
 
 from __future__ import annotations
@@ -109,3 +111,55 @@ def hop(
         padded = rays[..., jnp.arange(-most, size + most) % size]
     offsets = hops[:, 0] * stride + hops[:, 1]
     return jax.vmap(lambda row, offset: lax.dynamic_slice_in_dim(row, most - offset, size, axis=-1))(padded, offsets)
+
+
+class Torus(NamedTuple):
+    """How a plane is split over the mesh axes `u` and `v`: the slots of a block, and how many each block has in use."""
+
+    height: int
+    width: int
+    rows: tuple[int, ...]
+    columns: tuple[int, ...]
+
+
+def hop_around(rays: Float[Array, "D C M P"], hops: Int[Array, "D 2"], torus: Torus) -> Float[Array, "D C M P"]:
+    """`hop` where planes are split over the mesh, without margins; within `shard_map`."""
+    reach, height, width = rays.shape[2], torus.height, torus.width
+    plane = rays.reshape(*rays.shape[:3], height, width)
+    around = _halo(_halo(plane, 3, reach, torus.rows, "u"), 4, reach, torus.columns, "v")
+    size = (*rays.shape[1:3], height, width)
+    none = jnp.zeros_like(hops[0, 0])
+    one = lambda block, hop: lax.dynamic_slice(block, (none, none, reach - hop[0], reach - hop[1]), size)
+    return jax.vmap(one)(around, hops).reshape(rays.shape)
+
+
+def halo_steps(sizes: tuple[int, ...], reach: int) -> list[int]:
+    """The slices that a block passes on in each step, one way, for every block to get `reach`; blocks have 1 or more."""
+    least, most = min(sizes), max(sizes)
+    # Before step j + 1 a block has j others' slices, at least.
+    return [min(most, reach - j * least) for j in range(-(-reach // least))] if len(sizes) > 1 else []
+
+
+def _halo(field: Array, dim: int, reach: int, sizes: tuple[int, ...], name: str) -> Array:
+    """A field in blocks with `reach` slices more at both ends of those in use; `sizes` are in use in the blocks of the ring."""
+    slots, parts = field.shape[dim], len(sizes)
+    if parts == 1:
+        own = jnp.arange(-reach, slots + reach) % sizes[0]
+        return jnp.take(field, own, axis=dim, unique_indices=False)
+    here, used = lax.axis_index(name), jnp.asarray(sizes)
+    put = lambda whole, part, at: lax.dynamic_update_slice_in_dim(whole, part, at, dim)
+    room = reach + max(sizes)
+    edge = [(room, room) if d == dim else (0, 0) for d in range(field.ndim)]
+    around = jnp.pad(field, edge)
+    begin, end = jnp.int32(room), room + used[here]
+    steps = halo_steps(sizes, reach)
+    before = lax.dynamic_slice_in_dim(around, end - steps[0], steps[0], dim)
+    after = lax.slice_in_dim(field, 0, steps[0], axis=dim)
+    onwards = [(i, (i + 1) % parts) for i in range(parts)]
+    # A slot that is empty comes to lie where the next step's slices do.
+    for step, count in enumerate(steps, 1):
+        before = lax.ppermute(lax.slice_in_dim(before, before.shape[dim] - count, None, axis=dim), name, onwards)
+        after = lax.ppermute(lax.slice_in_dim(after, 0, count, axis=dim), name, [(to, i) for i, to in onwards])
+        around = put(put(around, before, begin - count), after, end)
+        begin, end = begin - used[(here - step) % parts], end + used[(here + step) % parts]
+    return lax.slice_in_dim(around, room - reach, room + slots + reach, axis=dim)

@@ -84,7 +84,7 @@ def solve(
       bound then tells how far that is from all the light. `solver` has no say.
     - `mesh`: `rm.pe_array(nu, nv)` splits the lattice over devices (see `partition`). Results are the same to rounding. What
       needs no sweep is done on one device: the geometry, light straight from point lights and small emitters, readings of
-      the solution. Not with the paper's scheme, nor under `jit` and `vmap`.
+      the solution. Not under `jit` and `vmap`.
     - `progress`: True or None shows a bar on a terminal when the solve takes long; False never; or a `Progress`.
 
     **Raises** `ValueError` or `TypeError` for unusable arguments, traced shapes among them, before any work; `RuntimeError`
@@ -100,15 +100,17 @@ def solve(
         meter.start(f"solve {scene.summary()}")
         prepared = prepare(scene) if prepared is None else prepared
         surfaces = prepared.surfaces
-        layout = prepared.layout_on(mesh)
+        layout = prepared.layout_on(mesh if cube is None else None)
         with jax.ensure_compile_time_eval():  # of what is known while JAX stages the rest
             check_sources(scene, surfaces)
         stuff = materials(scene, surfaces)
         _check_steady(scene, surfaces, stuff)
         if mesh is not None:
             geometry = (surfaces.position, surfaces.normal, surfaces.area)
-            check_agreement("scene", stop_gradient((geometry, stuff, quadrature.directions, float(rtol))))
-        nodes = None if cube is None else make_cube_system(scene, surfaces, cube)
+            numbers = stop_gradient((geometry, stuff, quadrature.directions, float(rtol)))
+            check_agreement("scene", numbers)
+            check_agreement("scheme", np.frombuffer(repr(cube).encode(), np.uint8))
+        nodes = None if cube is None else make_cube_system(scene, surfaces, cube, mesh)
         if nodes is not None:
             system, quadrature = nodes.system, nodes.quadrature
         else:
@@ -200,10 +202,6 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
         checks.fail("solver", repr(solver), kinds, 'leave it at "auto"')
     if mesh is not None:
         check_mesh(mesh, scene.lattice.shape)
-        if isinstance(scheme, LightRayCube):
-            checks.fail(
-                "mesh", f"a mesh with {scheme}", "rm.Characteristic()", "the paper's scheme runs on one device; leave mesh out"
-            )
         if checks.is_traced(stop_gradient(scene)):
             advice = "jax.grad and jvp go through outside of jit; or leave mesh out"
             checks.fail("mesh", "a mesh under jit or vmap", "a scene of known values", advice, TypeError)

@@ -48,8 +48,8 @@ from jaxtyping import Array, Float
 from .. import checks
 from ..layout import AXES
 from ..operator import Light, Materials
-from ..shift import hop
-from .ray_layout import Faces, Plane, RayLattice, entry_sides, make_plane, turned, turned_back
+from .ray_layout import Faces, Plane, RayLattice, entry_sides
+from .ray_partition import RayBlock
 
 _LEVEL = 1e-6  # |N . L / |L|| below this: the ray neither arrives nor leaves
 _ENDED = 1e-6  # share of the light on a periodic axis that no longer matters
@@ -83,7 +83,7 @@ class NodeFields(eqx.Module):
     """What rays meet, on the padded lattice; 0 at inert nodes."""
 
     normal: Float[Array, "3 X Y Z"]  # 0 but at SURFACE nodes
-    alive: Float[Array, "X Y Z"]  # 1 at FREE and SURFACE nodes
+    alive: Float[Array, "1 X Y Z"]  # 1 at FREE and SURFACE nodes
     exitance: Float[Array, "C X Y Z"]  # radiance leaving SURFACE nodes
     extinction: Float[Array, "C X Y Z"] | None = None  # 1 / scene unit
     source: Float[Array, "C X Y Z"] | None = None  # source function
@@ -101,7 +101,7 @@ def local_transformation(materials: Materials, arriving: Light) -> Light:
 
 
 def coordinate_evolution(
-    lattice: RayLattice,
+    lattice: RayLattice | RayBlock,
     fields: NodeFields,
     faces: Faces,
     scheme: LightRayCube,
@@ -134,17 +134,17 @@ def coordinate_evolution(
         edges = _on_face(face, lambda f: _edges(lattice, f))
         step = _Step(plane, slabs, edges, sky, scheme, lattice.spacing)
         return jax.tree.map(
-            lambda total, s: total + _on_face(face, lambda f: turned_back(plane.unflat(s), lattice, f)),
+            lambda total, s: total + _on_face(face, lambda f: lattice.turned_back(plane.unflat(s), f)),
             sums,
             _sweep_face(step, own, fluence),
         )
 
     if lattice.cubic:  # one program for the six faces: less to compile
-        plane = make_plane(lattice, 0)
+        plane = lattice.plane(0)
         sums = lax.fori_loop(0, 6, lambda f, sums: one_face(f, jax.tree.map(lambda a: a[f], faces), plane, sums), sums)
     else:
         for face in range(6):
-            sums = one_face(face, jax.tree.map(lambda a, f=face: a[f], faces), make_plane(lattice, face // 2), sums)
+            sums = one_face(face, jax.tree.map(lambda a, f=face: a[f], faces), lattice.plane(face // 2), sums)
     arriving, seen = jax.tree.map(lattice.from_padded, sums)
     return arriving / jnp.pi, None if seen is None else seen / (4 * jnp.pi)
 
@@ -167,8 +167,8 @@ class _Slabs(NamedTuple):
     source: Array | None
 
 
-def _slabs(lattice: RayLattice, plane: Plane, face: int, fields: NodeFields, gather: Array | None) -> _Slabs:
-    flat = lambda field: None if field is None else plane.flat(turned(field, lattice, face))
+def _slabs(lattice: RayLattice | RayBlock, plane: Plane, face: int, fields: NodeFields, gather: Array | None) -> _Slabs:
+    flat = lambda field: None if field is None else plane.flat(lattice.turned(field, face))
     along = lambda vectors: None if vectors is None else tuple(flat(vectors[a]) for a in AXES[face // 2])
     others = (fields.alive, fields.exitance, fields.extinction, fields.source)
     return _Slabs(along(fields.normal), along(gather), *map(flat, others))  # pyright: ignore[reportArgumentType]
@@ -181,7 +181,7 @@ class _Edges(NamedTuple):
     size: Array
 
 
-def _edges(lattice: RayLattice, face: int) -> _Edges:
+def _edges(lattice: RayLattice | RayBlock, face: int) -> _Edges:
     opened = [lattice.open[side] for side in entry_sides(face)]
     return _Edges(jnp.asarray(opened), jnp.asarray([lattice.shape[a] for a in AXES[face // 2][1:]]))
 
@@ -225,10 +225,7 @@ class _Step(NamedTuple):
         if self.sky is None:
             return None, None
         plane, edges = self.plane, self.edges
-        column = (jnp.arange(plane.stride)[None] >= edges.size[1]) & (plane.margin == 0)
-        # On the torus what is beyond the low end of a row lies at the end of the row before.
-        late = column & (own.hop[:, 1, None, None] > 0)
-        row = (jnp.arange(plane.height)[:, None] + late) % plane.height >= edges.size[0]
+        row, column = plane.beyond(edges.size, own.hop)
         through = lambda hops, low, high: jnp.where(hops > 0, low, high)[:, None, None]
         u = through(own.hop[:, 0], edges.open[1], edges.open[2])
         v = through(own.hop[:, 1], edges.open[3], edges.open[4])
@@ -242,7 +239,7 @@ class _Step(NamedTuple):
         """One hop, to slab k: the light that goes on; that arrives, times its cosine; and that is there."""
         plane, scheme = self.plane, self.scheme
         here = jax.tree.map(lambda a: lax.dynamic_index_in_dim(a, k, 0, keepdims=False), self.slabs)
-        rays = hop(rays, own.hop, plane.height, plane.width, plane.margin)
+        rays = plane.hop(rays, own.hop)
         if here.extinction is not None:
             rays = self._through_medium(k, rays, here, own, around)
         facing = _towards(here.normal, own)
@@ -274,9 +271,9 @@ class _Step(NamedTuple):
         """The share of each hop that is inside the lattice's sides along u and v; [D, 1, 1, P]."""
         plane = self.plane
         inside = jnp.ones((len(own.length), plane.height, plane.stride), own.length.dtype)
-        for i, (nodes, wraps) in enumerate(((plane.height, plane.wrap_u), (plane.width, plane.margin > 0))):
+        for i, (place, wraps) in enumerate(((plane.rows, plane.wrap_u), (plane.columns, plane.wrap_v))):
             if not wraps:
-                place, slope = jnp.arange(nodes), own.hop[:, i, None]
+                slope = own.hop[:, i, None]
                 ahead = jnp.where(slope > 0, place, self.edges.size[i] - 1 - place)
                 share = (jnp.maximum(ahead, 0) + 0.5) / jnp.maximum(jnp.abs(slope), 0.5)
                 inside = jnp.minimum(inside, jnp.expand_dims(share, 2 - i))
@@ -340,7 +337,7 @@ def _add(total: Array, k: Array, weight: Array, values: Array) -> Array:
     return lax.dynamic_update_index_in_dim(total, row + jnp.tensordot(weight, values, 1), k, 0)
 
 
-def count_laps(lattice: RayLattice, fields: NodeFields, faces: Faces, scheme: LightRayCube) -> Faces:
+def count_laps(lattice: RayLattice | RayBlock, fields: NodeFields, faces: Faces, scheme: LightRayCube) -> Faces:
     """The faces with the number of laps after which less than 1e-6 of the light on a periodic axis is left.
 
     Rays along an axis that meet nothing never end; so laps are counted until every ray that crosses the lattice's other axes
@@ -352,7 +349,7 @@ def count_laps(lattice: RayLattice, fields: NodeFields, faces: Faces, scheme: Li
         dark = eqx.tree_at(lambda f: f.source, dark, jnp.zeros_like(fields.source))
     laps = []
     for face in range(6):
-        plane, directions = make_plane(lattice, face // 2), jax.tree.map(lambda a, f=face: a[f], faces)
+        plane, directions = lattice.plane(face // 2), jax.tree.map(lambda a, f=face: a[f], faces)
         step = _Step(plane, _slabs(lattice, plane, face, dark, None), _edges(lattice, face), None, scheme, lattice.spacing)
         most = -(-m * max(others or lattice.shape) // plane.planes) + 1
 
@@ -360,7 +357,7 @@ def count_laps(lattice: RayLattice, fields: NodeFields, faces: Faces, scheme: Li
             own = _own(directions, number)
             around = step.around(own)
             lit = jnp.where(own.weight[:, None, None, None] > 0, jnp.ones_like(step.start(own, None)), 0.0)
-            more = lambda state: (state[0] < most) & (jnp.max(state[1]) > _ENDED)
+            more = lambda state: (state[0] < most) & (lattice.largest(jnp.max(state[1])) > _ENDED)
             return lax.while_loop(more, lambda s: (s[0] + 1, step.lap(s[1], own, around)), (jnp.int32(0), lit))[0] + 1
 
         one = jnp.ones_like(faces.laps[face])

@@ -15,6 +15,7 @@ Public: `evolved`, `evolved_back`.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -23,8 +24,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..adjoint import with_adjoint
+from ..partition import FIELD
 from .light_ray_cube import LightRayCube, NodeFields, _edges, _own, _slabs, _Step, coordinate_evolution
-from .ray_layout import Faces, RayLattice, make_plane, turned_back
+from .ray_layout import Faces, RayLattice
+from .ray_partition import RayBlock, RayPartition
 
 Sky = Float[Array, "C n"]
 Gather = Float[Array, "3 X Y Z"]
@@ -32,8 +35,8 @@ Results = tuple[Float[Array, "C nx ny nz"], Float[Array, "C nx ny nz"] | None]
 
 
 def evolved(
-    lattice: RayLattice, scheme: LightRayCube, fields: NodeFields, faces: Faces, sky: Sky | None, gather: Gather | None,
-    fluence: bool,
+    lattice: RayLattice | RayPartition, scheme: LightRayCube, fields: NodeFields, faces: Faces, sky: Sky | None,
+    gather: Gather | None, fluence: bool,
 ) -> Results:  # fmt: skip
     """`coordinate_evolution`, with derivatives in exitance, source, extinction and sky."""
     how = _Evolution(lattice, scheme, fluence)
@@ -41,7 +44,7 @@ def evolved(
 
 
 def evolved_back(
-    lattice: RayLattice, scheme: LightRayCube, fields: NodeFields, faces: Faces, asked: Results
+    lattice: RayLattice | RayPartition, scheme: LightRayCube, fields: NodeFields, faces: Faces, asked: Results
 ) -> tuple[Float[Array, "C X Y Z"], Float[Array, "C X Y Z"] | None]:
     """The transpose in exitance and source (None without a medium), padded, from weights of the sums."""
     how = _Evolution(lattice, scheme, asked[1] is not None)
@@ -52,34 +55,50 @@ def evolved_back(
 
 @dataclasses.dataclass(frozen=True)
 class _Evolution:
-    lattice: RayLattice
+    lattice: RayLattice | RayPartition
     scheme: LightRayCube
     fluence: bool
 
     def __call__(self, fields: NodeFields, faces: Faces, sky: Sky | None, gather: Gather | None) -> Results:
-        return coordinate_evolution(self.lattice, fields, faces, self.scheme, sky, gather, self.fluence)
+        def evolution(lattice, fields, gather, faces, sky):
+            return coordinate_evolution(lattice, fields, faces, self.scheme, sky, gather, self.fluence)
+
+        return self._over(evolution, fields, faces, sky, gather)
 
     def taped(self, fields: NodeFields, faces: Faces, sky: Sky | None, gather: Gather | None) -> Results:
         """The same, in loops of known length that JAX can turn round."""
-        zeros = jnp.zeros((fields.exitance.shape[0], *self.lattice.padded), fields.exitance.dtype)
+        return self._over(self._taped, fields, faces, sky, gather)
+
+    def _over(self, evolution: Callable, fields: NodeFields, faces: Faces, sky: Sky | None, gather: Gather | None) -> Results:
+        """On one device, or on all of a mesh."""
+        if isinstance(self.lattice, RayLattice):
+            return evolution(self.lattice, fields, gather, faces, sky)
+        local = lambda block, fields, _, same: evolution(block, *fields, *same)
+        return self.lattice.on_blocks(local, (fields, gather), (), (faces, sky), (FIELD, FIELD if self.fluence else None))
+
+    def _taped(
+        self, lattice: RayLattice | RayBlock, fields: NodeFields, gather: Gather | None, faces: Faces, sky: Sky | None
+    ) -> Results:
+        zeros = jnp.zeros((fields.exitance.shape[0], *lattice.padded), fields.exitance.dtype)
         sums = (zeros, zeros if self.fluence else None)
         for face in range(6):
-            plane = make_plane(self.lattice, face // 2)
-            slabs, edges = _slabs(self.lattice, plane, face, fields, gather), _edges(self.lattice, face)
-            step = _Step(plane, slabs, edges, sky, self.scheme, self.lattice.spacing)
-            found = _face(step, jax.tree.map(lambda a, f=face: a[f], faces), self._laps(face // 2), self.fluence)
-            back = jax.tree.map(lambda s, f=face, p=plane: turned_back(p.unflat(s), self.lattice, f), found)
+            plane = lattice.plane(face // 2)
+            slabs, edges = _slabs(lattice, plane, face, fields, gather), _edges(lattice, face)
+            step = _Step(plane, slabs, edges, sky, self.scheme, lattice.spacing)
+            found = _face(step, jax.tree.map(lambda a, f=face: a[f], faces), self._laps(lattice, face // 2), self.fluence)
+            back = jax.tree.map(lambda s, f=face, p=plane: lattice.turned_back(p.unflat(s), f), found)
             sums = jax.tree.map(jnp.add, sums, back)
-        arriving, seen = jax.tree.map(self.lattice.from_padded, sums)
+        arriving, seen = jax.tree.map(lattice.from_padded, sums)
         return arriving / jnp.pi, None if seen is None else seen / (4 * jnp.pi)
 
-    def _laps(self, axis: int) -> int:
+    @staticmethod
+    def _laps(lattice: RayLattice | RayBlock, axis: int) -> int:
         """The most laps before the last along an axis; `count_laps` has the reason."""
-        if not self.lattice.periodic[axis]:
+        if not lattice.periodic[axis]:
             return 0
-        shape = self.lattice.shape
-        others = [n for n, wraps in zip(shape, self.lattice.periodic, strict=True) if not wraps]
-        return -(-self.lattice.half_width * max(others or shape) // shape[axis]) + 1
+        shape = lattice.shape
+        others = [n for n, wraps in zip(shape, lattice.periodic, strict=True) if not wraps]
+        return -(-lattice.half_width * max(others or shape) // shape[axis]) + 1
 
 
 @dataclasses.dataclass(frozen=True)

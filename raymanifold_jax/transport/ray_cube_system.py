@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int
 
 from .. import checks
@@ -28,6 +29,8 @@ from ..direct import Direct, _from_point, _from_sun, brightest, sky_radiance
 from ..iteration import System
 from ..layout import make_layout
 from ..operator import Light, materials
+from ..partition import SAME, put
+from ..placement import restored, stored
 from ..quadrature import Quadrature, light_ray_cube
 from ..scene import MIRROR, OPEN, PointLight, Scene, Sky, Sun
 from ..surfaces import Surfaces
@@ -35,16 +38,17 @@ from .light_ray_cube import LightRayCube, NodeFields, count_laps, local_transfor
 from .ray_cube_derivative import evolved, evolved_back
 from .ray_layout import Faces, RayLattice, make_faces
 from .ray_nodes import RayNodes, find_nodes
+from .ray_partition import RayPartition, make_ray_partition
 
 
 class CubeTransport(eqx.Module):
     """One coordinate evolution as an operator on the light of SURFACE nodes (elements) and voxels."""
 
-    lattice: RayLattice
+    lattice: RayLattice | RayPartition
     scheme: LightRayCube
     faces: Faces
     fields: NodeFields  # without light
-    cell: Int[Array, " E"]
+    cell: Int[Array, " E"] | Int[Array, "P I"]  # where SURFACE nodes are, on each device of a mesh
 
     @eqx.filter_jit
     def __call__(
@@ -56,7 +60,7 @@ class CubeTransport(eqx.Module):
         """
         fields = self._with_light(leaving)
         arriving, seen = evolved(self.lattice, self.scheme, fields, self.faces, sky, None, fluence)
-        return Light(arriving.reshape(len(arriving), -1)[:, self.cell], seen)
+        return Light(self.lattice.collect(arriving, self.cell), seen)
 
     @eqx.filter_jit
     def outgoing(
@@ -69,22 +73,16 @@ class CubeTransport(eqx.Module):
     @eqx.filter_jit
     def transposed(self, asked: Light, scattered: bool = False) -> Light:
         """The transpose in what leaves: weights of arriving light back to weights of what was sent."""
-        bands, count = asked.elements.shape[0], int(np.prod(self.lattice.shape))
-        at_nodes = jnp.zeros((bands, count), asked.elements.dtype).at[:, self.cell].set(asked.elements)
         fields = self._with_light(jax.tree.map(jnp.zeros_like, asked))
-        weights = at_nodes.reshape(bands, *self.lattice.shape), asked.voxels
+        weights = self.lattice.spread(asked.elements, self.cell), asked.voxels
         exitance, source = evolved_back(self.lattice, self.scheme, fields, self.faces, weights)
-        exitance = self.lattice.from_padded(exitance).reshape(bands, -1)[:, self.cell]
+        exitance = self.lattice.collect(self.lattice.from_padded(exitance), self.cell)
         return Light(exitance, None if source is None else self.lattice.from_padded(source))
 
     def _with_light(self, leaving: Light) -> NodeFields:
-        bands = leaving.elements.shape[0]
-        exitance = jnp.zeros((bands, int(np.prod(self.lattice.shape))), leaving.elements.dtype)
-        exitance = exitance.at[:, self.cell].set(leaving.elements).reshape(bands, *self.lattice.shape)
-        source = None
+        exitance, source = self.lattice.spread(leaving.elements, self.cell), None
         if self.fields.extinction is not None:
-            dark = jnp.zeros_like(exitance)
-            source = self.lattice.to_padded(dark if leaving.voxels is None else leaving.voxels)
+            source = self.lattice.to_padded(jnp.zeros_like(exitance) if leaving.voxels is None else leaving.voxels)
         return dataclasses.replace(self.fields, exitance=self.lattice.to_padded(exitance), source=source)
 
 
@@ -104,9 +102,16 @@ class CubeSystem:
     def solid(self) -> np.ndarray:
         return self.nodes.solid
 
+    @property
+    def _transport(self) -> CubeTransport:
+        transport = self.system.transport
+        assert isinstance(transport, CubeTransport)
+        return transport
+
     def at_elements(self, rest: Light, sun: Light) -> tuple[Light, Light]:
         """The light at nodes as light at the scene's elements: means over layers, and what leaves through open sides."""
         leaving = self._leaving(rest + sun)
+        rest, sun = restored(self._transport.lattice, (rest, sun))
         is_open = jnp.asarray(self.surfaces.open)
         seen = lambda light, through: Light(jnp.where(is_open, through, self._mean(light.elements)), light.voxels)
         return seen(rest, leaving), seen(sun, self.sun_leaving)
@@ -122,23 +127,23 @@ class CubeSystem:
         """Mean radiance that leaves through open sides, at their elements (0 elsewhere), of all light that arrives."""
         sent = local_transformation(self.system.materials, arriving)
         surfaces = self.surfaces
+        transport = self._transport
         total = jnp.zeros((sent.elements.shape[0], len(surfaces)), sent.elements.dtype)
         for axis in range(3):
             rows = np.flatnonzero(surfaces.open & (surfaces.side // 2 == axis))
             if len(rows):
-                transport = self.system.transport
-                assert isinstance(transport, CubeTransport)
                 inward = np.zeros((3, *self.nodes.solid.shape))
                 ends = np.moveaxis(inward[axis], axis, 0)
                 ends[0], ends[-1] = 1.0, -1.0
-                out = transport.outgoing(sent, self.sky, jnp.asarray(inward, sent.elements.dtype))
+                inward = stored(transport.lattice, jnp.asarray(inward, sent.elements.dtype))
+                out = restored(transport.lattice, transport.outgoing(sent, self.sky, inward))
                 last = np.clip(surfaces.voxel[rows], 0, np.array(self.nodes.solid.shape) - 1)
                 total = total.at[:, rows].set(out[(slice(None), *last.T)])
         return total
 
 
-def make_cube_system(scene: Scene, surfaces: Surfaces, scheme: LightRayCube) -> CubeSystem:
-    """The equations of a scene, with the light straight from its sources.
+def make_cube_system(scene: Scene, surfaces: Surfaces, scheme: LightRayCube, mesh: Mesh | None = None) -> CubeSystem:
+    """The equations of a scene, with the light straight from its sources; over a mesh if there is one.
 
     **Raises** `ValueError` for MIRROR sides, for a lattice too coarse for the half-width, and for linear attenuation where a
     hop's extinction is more than 1.
@@ -155,19 +160,25 @@ def make_cube_system(scene: Scene, surfaces: Surfaces, scheme: LightRayCube) -> 
     padded = [n if wraps else n + m for n, wraps in zip(scene.lattice.shape, periodic, strict=True)]
     opened = tuple(kind is OPEN for kind in scene.boundary.sides)
     lattice = RayLattice(scene.lattice.shape, (padded[0], padded[1], padded[2]), periodic, opened, m, scene.lattice.spacing)
+    cell: Array = jnp.asarray(nodes.cell, np.int32)
+    if mesh is not None:
+        lattice, cell = make_ray_partition(lattice, mesh, nodes.cell)
+    own = stored(lattice, stuff)
     real = jnp.zeros(0).dtype
-    spread = lambda field: lattice.to_padded(jnp.asarray(field, real))
-    extinction = None if stuff.extinction is None else lattice.to_padded(stuff.extinction)
-    fields = NodeFields(spread(nodes.normal), spread(~nodes.solid), jnp.zeros((0, 0, 0, 0), real), extinction)
-    faces = make_faces(m, m * int(np.prod(sorted(padded)[1:])) * scene.bands)
+    spread = lambda field: lattice.to_padded(stored(lattice, jnp.asarray(field, real)))
+    extinction = None if own.extinction is None else lattice.to_padded(own.extinction)
+    fields = NodeFields(spread(nodes.normal), spread(~nodes.solid[None]), jnp.zeros((0, 0, 0, 0), real), extinction)
+    faces = make_faces(m, m * lattice.largest_plane * scene.bands)
+    if mesh is not None:
+        faces = jax.tree.map(lambda a: put(mesh, a, SAME), faces)
     faces = _with_laps(lattice, fields, faces, scheme, scene.bands)
-    transport = CubeTransport(lattice, scheme, faces, fields, jnp.asarray(nodes.cell, np.int32))
+    transport = CubeTransport(lattice, scheme, faces, fields, cell)
     quadrature = light_ray_cube(m)
     has_sky = any(isinstance(light, Sky) for light in scene.lights)
     sky = sky_radiance(scene, quadrature.directions) if has_sky else None
     suns, suns_leaving = _suns(scene, surfaces, nodes)
-    direct = Direct(suns, _rest(scene, nodes, transport, stuff, sky), brightest(scene, sky))
-    system = System(transport, stuff, direct)  # pyright: ignore[reportArgumentType]
+    direct = Direct(stored(lattice, suns), _rest(scene, nodes, transport, own, sky), brightest(scene, sky))
+    system = System(transport, own, direct)  # pyright: ignore[reportArgumentType]
     return CubeSystem(system, nodes, surfaces, quadrature, _columns(scene, surfaces, nodes, m), sky, suns_leaving)
 
 
@@ -190,26 +201,37 @@ def _check_depth(scheme: LightRayCube, extinction: float, spacing: float) -> Non
         )
 
 
-def _with_laps(lattice: RayLattice, fields: NodeFields, faces: Faces, scheme: LightRayCube, bands: int) -> Faces:
+def _with_laps(
+    lattice: RayLattice | RayPartition, fields: NodeFields, faces: Faces, scheme: LightRayCube, bands: int
+) -> Faces:
     if not any(lattice.periodic):
         return faces
     dark = jnp.zeros((bands, *lattice.padded), fields.normal.dtype)
     source = None if fields.extinction is None else dark
     extinction = None if fields.extinction is None else lax.stop_gradient(fields.extinction)
     lit = dataclasses.replace(fields, exitance=dark, extinction=extinction, source=source)
-    return eqx.filter_jit(count_laps)(lattice, lit, faces, scheme)
+    return _count_laps(lattice, lit, faces, scheme)
+
+
+@eqx.filter_jit
+def _count_laps(lattice: RayLattice | RayPartition, fields: NodeFields, faces: Faces, scheme: LightRayCube) -> Faces:
+    if isinstance(lattice, RayLattice):
+        return count_laps(lattice, fields, faces, scheme)
+    local = lambda block, fields, _, faces: count_laps(block, fields, faces, scheme)
+    return lattice.on_blocks(local, fields, (), faces, SAME)
 
 
 def _rest(scene: Scene, nodes: RayNodes, transport: CubeTransport, stuff, sky) -> Light:
     """First-flight light of skies, emitting surfaces and media, and point lights."""
     emits = checks.may_differ_from_zero((stuff.emission, stuff.medium_source))
     if sky is None and not emits:
-        rest = Light(jnp.zeros_like(stuff.emission), jnp.zeros((scene.bands, *scene.lattice.shape), stuff.emission.dtype))
+        dark = jnp.zeros((scene.bands, *scene.lattice.shape), stuff.emission.dtype)
+        rest = Light(jnp.zeros_like(stuff.emission), stored(transport.lattice, dark))
     else:
         rest = transport(Light(stuff.emission, stuff.medium_source), sky)
     for light in scene.lights:
         if isinstance(light, PointLight):
-            rest = rest + _from_point(scene, nodes.table, light)
+            rest = rest + stored(transport.lattice, _from_point(scene, nodes.table, light))
     return rest
 
 

@@ -4,7 +4,9 @@ A *face* is one of the six of the light ray cube: face 2a holds the directions t
 down it. Its planes, in the order in which its rays meet them, are taken M at a time: such a *slab* holds one plane of each of
 the M interleaved families that hops of M planes make.
 
-Public: `Faces`, `make_faces`, `RayLattice`, `Plane`, `make_plane`, `turned`, `turned_back`, `entry_sides`.
+`RayLattice` is the lattice on one device; `ray_partition.RayBlock` stands for it where the lattice is split over a mesh.
+
+Public: `Faces`, `make_faces`, `RayLattice`, `Plane`, `entry_sides`.
 """
 
 from __future__ import annotations
@@ -15,10 +17,11 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..layout import AXES
 from ..quadrature import cube_points, light_ray_cube
+from ..shift import Torus, hop, hop_around
 
 CHUNK = 1 << 19  # rays times bands in one step: a compromise between a CPU's caches and the cost of starting a step
 
@@ -81,6 +84,11 @@ class RayLattice(eqx.Module):
         """Whether the six faces are alike, and can share one program."""
         return len(set(self.padded)) == len(set(self.shape)) == len(set(self.periodic)) == 1
 
+    @property
+    def largest_plane(self) -> int:
+        """Nodes."""
+        return int(np.prod(sorted(self.padded)[1:]))
+
     def to_padded(self, field: Float[Array, "*C nx ny nz"]) -> Float[Array, "*C X Y Z"]:
         width = [(0, n - m) for n, m in zip(self.padded, self.shape, strict=True)]
         return jnp.pad(field, [(0, 0)] * (field.ndim - 3) + width)
@@ -88,20 +96,59 @@ class RayLattice(eqx.Module):
     def from_padded(self, field: Float[Array, "*C X Y Z"]) -> Float[Array, "*C nx ny nz"]:
         return field[(..., *(slice(n) for n in self.shape))]
 
+    def spread(self, values: Float[Array, "C S"], cell: Int[Array, " S"]) -> Float[Array, "C nx ny nz"]:
+        """Lists of SURFACE nodes, at the flat indices `cell`, as fields."""
+        field = jnp.zeros((len(values), int(np.prod(self.shape))), values.dtype)
+        return field.at[:, cell].set(values).reshape(-1, *self.shape)
+
+    def collect(self, field: Float[Array, "C nx ny nz"], cell: Int[Array, " S"]) -> Float[Array, "C S"]:
+        """The inverse of `spread`."""
+        return field.reshape(len(field), -1)[:, cell]
+
+    def plane(self, axis: int) -> Plane:
+        """The planes of a sweep along an axis."""
+        _, u, v = AXES[axis]
+        n, wraps, padded, m = self.shape, self.periodic, self.padded, self.half_width
+        margin = m if wraps[v] else 0
+        rows, columns = np.arange(padded[u]), np.arange(padded[v] + 2 * margin)
+        return Plane(n[axis], wraps[axis], wraps[u], wraps[v], m, padded[u], padded[v], margin, rows, columns)
+
+    def turned(self, field: Float[Array, "*C X Y Z"], face: int) -> Float[Array, "*C A U V"]:
+        """A field with the face's axis first and its planes in the order in which rays meet them."""
+        lead, axis = field.ndim - 3, face // 2
+        field = field.transpose(*range(lead), *(lead + a for a in AXES[axis]))
+        return in_order(field, self.shape[axis], face)
+
+    def turned_back(self, field: Float[Array, "*C A U V"], face: int) -> Float[Array, "*C X Y Z"]:
+        """The inverse of `turned`; 0 behind the lattice's last planes."""
+        lead, axis = field.ndim - 3, face // 2
+        field = jnp.flip(field, lead) if face % 2 else field
+        field = jnp.pad(field, [(0, 0)] * lead + [(0, self.padded[axis] - self.shape[axis]), (0, 0), (0, 0)])
+        return field.transpose(*range(lead), *(lead + AXES[axis].index(a) for a in range(3)))
+
+    def largest(self, values: Array) -> Array:
+        """Of all devices, of which there is one."""
+        return values
+
 
 class Plane(NamedTuple):
     """The (u, v) plane of a sweep, flat: `height` rows of `width` nodes, with `margin` nodes more at both ends of each row.
 
-    Margins hold copies of nodes beyond the ends, where v is periodic.
+    Margins hold copies of nodes beyond the ends, where v is periodic. A plane that is split over a mesh (`torus`) has none: each
+    block is the part of one device.
     """
 
     planes: int
     periodic: bool  # the sweep axis
     wrap_u: bool
+    wrap_v: bool
     half_width: int
     height: int
     width: int
     margin: int
+    rows: Int[Array, " U"] | Int[np.ndarray, " U"]  # the numbers on the lattice; -1: a slot without nodes
+    columns: Int[Array, " V"] | Int[np.ndarray, " V"]  # margins included
+    torus: Torus | None = None
 
     @property
     def stride(self) -> int:
@@ -121,27 +168,26 @@ class Plane(NamedTuple):
         field = field.reshape(*field.shape[:-3], -1, self.height, self.stride)
         return field[..., : self.planes, :, self.margin : self.margin + self.width]
 
+    def hop(self, rays: Float[Array, "D C M P"], hops: Int[Array, "D 2"]) -> Float[Array, "D C M P"]:
+        """Move the rays of each direction by its hop (p, q)."""
+        if self.torus is not None:
+            return hop_around(rays, hops, self.torus)
+        return hop(rays, hops, self.height, self.width, self.margin)
 
-def make_plane(lattice: RayLattice, axis: int) -> Plane:
-    _, u, v = AXES[axis]
-    margin = lattice.half_width if lattice.periodic[v] else 0
-    n, wraps, padded, m = lattice.shape, lattice.periodic, lattice.padded, lattice.half_width
-    return Plane(n[axis], wraps[axis], wraps[u], m, padded[u], padded[v], margin)
+    def beyond(self, size: Int[Array, " 2"], hops: Int[Array, "D 2"]) -> tuple[Bool[Array, "D U V"], Bool[Array, "D U V"]]:
+        """The inert nodes behind the last row, and behind the last column, of a lattice of this `size` along (u, v)."""
+        column = (self.columns[None] >= size[1]) & (not self.wrap_v)
+        if self.torus is not None:
+            return (self.rows[:, None] >= size[0])[None], column[None]
+        # On flat planes what is beyond the low end of a row lies at the end of the row before.
+        late = column & (hops[:, 1, None, None] > 0)
+        return (self.rows[:, None] + late) % self.height >= size[0], column[None]
 
 
-def turned(field: Float[Array, "*C X Y Z"], lattice: RayLattice, face: int) -> Float[Array, "*C A U V"]:
-    """A field with the face's axis first and its planes in the order in which rays meet them."""
-    lead, axis = field.ndim - 3, face // 2
-    field = field.transpose(*range(lead), *(lead + a for a in AXES[axis]))
-    field = lax.slice_in_dim(field, 0, lattice.shape[axis], axis=lead)
-    return jnp.flip(field, lead) if face % 2 else field
-
-
-def turned_back(field: Float[Array, "*C A U V"], lattice: RayLattice, face: int) -> Float[Array, "*C X Y Z"]:
-    lead, axis = field.ndim - 3, face // 2
-    field = jnp.flip(field, lead) if face % 2 else field
-    field = jnp.pad(field, [(0, 0)] * lead + [(0, lattice.padded[axis] - lattice.shape[axis]), (0, 0), (0, 0)])
-    return field.transpose(*range(lead), *(lead + AXES[axis].index(a) for a in range(3)))
+def in_order(field: Float[Array, "*C A U V"], planes: int, face: int) -> Float[Array, "*C A U V"]:
+    """The first planes, as many as rays meet, in the order in which those of a face do."""
+    field = lax.slice_in_dim(field, 0, planes, axis=field.ndim - 3)
+    return jnp.flip(field, field.ndim - 3) if face % 2 else field
 
 
 def entry_sides(face: int) -> tuple[int, int, int, int, int]:
