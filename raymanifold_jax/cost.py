@@ -14,6 +14,14 @@ characteristic scheme, whose slabs are one plane thick):
 Sizes are those of the axis with the largest blocks; `exchanged` and `updates` are sums over the three axes. The (p, q) of a
 direction is its hop; in the characteristic scheme its slopes, at most one node a plane.
 
+`exchanged` is what must go to another element. This program sends more (`sent`): the rims of a block on all sides, wherever a
+direction's rays go, so that all directions of a chunk move in one message. With W x H the slots of the block in use, on the
+lattice with its inert nodes (M behind, or one on either side), and r the rows that a rim passes on until every block has M
+(M itself, where no block is narrower):
+
+    light ray cube    ceil(n / M) M C s (2 r_u W + 2 r_v (H + 2M))    a direction
+    characteristic    2 n C s (2 W + 2 H)                             a direction: two shifts a plane
+
 Public: `CostReport`, `cost_report`, `numbers_per_node`, `PAPER`.
 """
 
@@ -26,9 +34,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import checks
+from .blocks import even
 from .layout import AXES
+from .partition import SLOTS
 from .quadrature import Quadrature, cube_points, fibonacci
 from .scene import Scene
+from .shift import halo_steps
 from .transport.characteristic import Characteristic
 from .transport.light_ray_cube import LightRayCube
 
@@ -80,6 +91,7 @@ class CostReport:
     ray_updates: int  # an iteration
     ray_updates_once: int  # the same with each of the cube's directions swept once
     exchanged_bytes: int  # a sweep of all directions
+    sent_bytes: int  # a sweep of all directions, by this program
     rotation_bytes: int
     seconds_on_the_paper_machine: float
     largest_size: int  # voxels a side that fit into the paper's 16 KB an element
@@ -103,6 +115,7 @@ class CostReport:
             ("ray updates an iteration", f"{self.ray_updates:,}", f"{paper.ray_updates:,}"),
             ("  each direction once", f"{self.ray_updates_once:,}", ""),
             ("exchanged a sweep", _bytes(self.exchanged_bytes), ""),
+            ("  sent by this program", _bytes(self.sent_bytes), ""),
             ("exchanged a rotation", _bytes(self.rotation_bytes), ""),
             ("iteration on that machine", f"{seconds:,.4g} s", f"{paper.iteration_seconds:g} s"),
             ("  local transformation", "", f"{paper.local_transformation_seconds:g} s"),
@@ -150,8 +163,8 @@ def cost_report(scene: Any, scheme: Any = None, pe: Any = (64, 32), quadrature: 
     seconds += share * (PAPER.local_transformation_seconds + 3 * PAPER.rotation_seconds)
     name = f"LightRayCube({scheme.half_width})" if isinstance(scheme, LightRayCube) else "Characteristic"
     return CostReport(
-        name, scene.lattice.shape, (a, b), nodes, scene_bytes, ray_bytes, updates, once, exchanged, rotation, seconds, low,
-        fits(512),
+        name, scene.lattice.shape, (a, b), nodes, scene_bytes, ray_bytes, updates, once, exchanged,
+        _sent(scene, (a, b), groups, scheme), rotation, seconds, low, fits(512),
     )  # fmt: skip
 
 
@@ -194,6 +207,25 @@ def _costs(shape, pe, groups, scheme, bands: int, medium: bool) -> tuple[int, in
         nodes, nodes * node_bytes, rays * bands * number, updates, whole(once), whole(exchanged * bands * number),
         whole(nodes * node_bytes * around),
     )  # fmt: skip
+
+
+def _sent(scene: Scene, pe: tuple[int, int], groups: list[tuple[np.ndarray, float]], scheme: Any) -> int:
+    """Of a sweep of all directions, once around periodic axes."""
+    cube = isinstance(scheme, LightRayCube)
+    reach, margin = (scheme.half_width,) * 2 if cube else (1, 2)
+    shape = scene.lattice.shape
+    lattice = [n if periodic else n + margin for n, periodic in zip(shape, scene.boundary.periodic, strict=True)]
+    sent = 0
+    for axis, (hops, _) in enumerate(groups):
+        blocks = [even(lattice[a], parts, least) for a, parts, least in zip(AXES[axis][1:], pe, SLOTS, strict=True)]
+        rows, columns = (sum(halo_steps([int(n) for n in (block >= 0).sum(1)], reach)) for block in blocks)
+        height, width = (block.shape[1] for block in blocks)
+        if cube:
+            steps, rims = -(-shape[axis] // reach) * reach, rows * width + columns * (height + 2 * reach)
+        else:
+            steps, rims = 2 * shape[axis], rows * width + columns * height
+        sent += len(hops) * steps * 2 * rims
+    return sent * scene.bands * jnp.zeros(0).dtype.itemsize
 
 
 def _bytes(size: float) -> str:

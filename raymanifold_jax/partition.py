@@ -37,7 +37,7 @@ from .sharding import NAMES
 from .shift import Ring, neighbours
 
 FIELD, TABLE, SAME = Spec(None, *NAMES), Spec(NAMES), Spec()  # of fields; with a row for each device; the same everywhere
-_SLOTS = (1, 2)  # at least, of a block along u and v: moves by one row and by one column of flat planes must differ
+SLOTS = (1, 2)  # at least, of a block along u and v: moves by one row and by one column of flat planes must differ
 
 
 class _Tables(eqx.Module):
@@ -73,7 +73,7 @@ class Shapes(eqx.Module):
 
     def split(self, axis: int, name: str) -> Int[np.ndarray, "p s"]:
         """The padded columns of each block of an axis."""
-        return even(self.lattice[axis], self.parts(name), _SLOTS[NAMES.index(name)])
+        return even(self.lattice[axis], self.parts(name), SLOTS[NAMES.index(name)])
 
     def origin(self, axis: int) -> Int[np.ndarray, " N"]:
         """The scene's column that each padded one is an image of; -1: none."""
@@ -148,9 +148,7 @@ class Shapes(eqx.Module):
     def columns(self, axis: int) -> tuple[Array, Array]:
         """The padded rows and columns of the planes here, within `shard_map`; -1: none."""
         _, u, v = AXES[axis]
-        return tuple(
-            jnp.asarray(self.split(a, name))[lax.axis_index(name)] for a, name in zip((u, v), NAMES, strict=True)
-        )  # pyright: ignore[reportReturnType]
+        return tuple(jnp.asarray(self.split(a, name))[lax.axis_index(name)] for a, name in zip((u, v), NAMES, strict=True))  # pyright: ignore[reportReturnType]
 
 
 class Uncompared:

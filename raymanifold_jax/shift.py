@@ -1,13 +1,13 @@
 """Moving rays to the neighbouring voxels: the only communication of a sweep.
 
 On one device that is a local move. Where a plane is split in blocks over the mesh axes `u` and `v` (see `partition`), a block
-gets the rim of its neighbours first, around a ring (the torus of the paper's machine). Rays of the light ray cube, which move by
-up to M nodes at once, get a halo of M; where blocks are narrower than that it comes in several steps, each from one block to
-the next.
+gets the rim of its neighbours first, around a ring (the torus of the paper's machine). Rays of the light ray cube move by up to
+M nodes at once and get a halo of M; where blocks are narrower than that it comes in several steps, from one block to the next.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -133,7 +133,7 @@ def hop_around(rays: Float[Array, "D C M P"], hops: Int[Array, "D 2"], torus: To
     return jax.vmap(one)(around, hops).reshape(rays.shape)
 
 
-def halo_steps(sizes: tuple[int, ...], reach: int) -> list[int]:
+def halo_steps(sizes: Sequence[int], reach: int) -> list[int]:
     """The slices that a block passes on in each step, one way, for every block to get `reach`; blocks have 1 or more."""
     least, most = min(sizes), max(sizes)
     # Before step j + 1 a block has j others' slices, at least.

@@ -201,9 +201,7 @@ def _check_depth(scheme: LightRayCube, extinction: float, spacing: float) -> Non
         )
 
 
-def _with_laps(
-    lattice: RayLattice | RayPartition, fields: NodeFields, faces: Faces, scheme: LightRayCube, bands: int
-) -> Faces:
+def _with_laps(lattice: RayLattice | RayPartition, fields: NodeFields, faces: Faces, scheme: LightRayCube, bands: int) -> Faces:
     if not any(lattice.periodic):
         return faces
     dark = jnp.zeros((bands, *lattice.padded), fields.normal.dtype)

@@ -134,8 +134,8 @@ class RayLattice(eqx.Module):
 class Plane(NamedTuple):
     """The (u, v) plane of a sweep, flat: `height` rows of `width` nodes, with `margin` nodes more at both ends of each row.
 
-    Margins hold copies of nodes beyond the ends, where v is periodic. A plane that is split over a mesh (`torus`) has none: each
-    block is the part of one device.
+    Margins hold copies of nodes beyond the ends, where v is periodic. A plane that is split over a mesh (`torus`) has none:
+    each block is the part of one device.
     """
 
     planes: int
@@ -176,12 +176,13 @@ class Plane(NamedTuple):
 
     def beyond(self, size: Int[Array, " 2"], hops: Int[Array, "D 2"]) -> tuple[Bool[Array, "D U V"], Bool[Array, "D U V"]]:
         """The inert nodes behind the last row, and behind the last column, of a lattice of this `size` along (u, v)."""
-        column = (self.columns[None] >= size[1]) & (not self.wrap_v)
+        rows, columns = jnp.asarray(self.rows), jnp.asarray(self.columns)
+        column = (columns[None] >= size[1]) & (not self.wrap_v)
         if self.torus is not None:
-            return (self.rows[:, None] >= size[0])[None], column[None]
+            return (rows[:, None] >= size[0])[None], column[None]
         # On flat planes what is beyond the low end of a row lies at the end of the row before.
         late = column & (hops[:, 1, None, None] > 0)
-        return (self.rows[:, None] + late) % self.height >= size[0], column[None]
+        return (rows[:, None] + late) % self.height >= size[0], column[None]
 
 
 def in_order(field: Float[Array, "*C A U V"], planes: int, face: int) -> Float[Array, "*C A U V"]:

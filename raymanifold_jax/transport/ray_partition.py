@@ -1,8 +1,8 @@
 """The nodes of the light-ray-cube scheme in blocks over a 2D mesh of devices.
 
 Blocks are those of `partition`, of a lattice whose axes that are not periodic end in M inert nodes: so its ends can be joined,
-and all blocks lie on a torus. Rays hop from block to block with a halo of M nodes (`shift.hop_around`). Values of SURFACE nodes,
-which are lists on one device, are lists in blocks here: each device has those of its nodes, and zeros behind them.
+and all blocks lie on a torus. Rays hop from block to block with a halo of M nodes (`shift.hop_around`). Values of SURFACE
+nodes, which are lists on one device, are lists in blocks here: each device has those of its nodes, and zeros behind them.
 
 `RayPartition` is the lattice as all devices together hold it, from outside; `RayBlock` is the part of one, within `shard_map`.
 Both stand for a `ray_layout.RayLattice`.
