@@ -16,6 +16,7 @@ _QUESTIONS = {
     "convergence": "How many sweeps to a certified error of 1e-4, over albedos and optical depths?",
     "gradient": "What do an image loss and its gradient cost, beside the solve alone?",
     "speed": "How long do a sweep, a bounce and a whole solve take, and how does that grow?",
+    "paper": "What do the paper's two figures take and show, by its scheme and by ours?",
     "peer": "How long do we take for an error of 1 %, and how long does a path tracer on the same cores?",
 }
 
@@ -295,6 +296,36 @@ def speed(
             write(json_file, _QUESTIONS["speed"], records, environment=environment())
     _print_environment(environment())
     click.echo(speed_table(records))
+
+
+@main.command()
+@click.option("--size", type=_at_least(12), default=128, show_default=True, help="Voxels along a side; the paper's N.")
+@click.option("--half-width", type=_at_least(1), default=5, show_default=True, help="Of the light ray cube; the paper's M.")
+@click.option("--directions", type=_at_least(9), default=200, show_default=True, help="Of the characteristic scheme.")
+@click.option("--pixels", type=_at_least(8), default=384, show_default=True, help="Of each picture, along a side.")
+@click.option("--repeats", type=_at_least(1), default=5, show_default=True, help="Timed sweeps after the first.")
+@click.option("--out", type=_NewFile(), metavar="FILE.png", help="Write the pictures there, side by side.")
+@_json
+def paper(
+    size: int, half_width: int, directions: int, pixels: int, repeats: int, out: Path | None, json_file: Path | None
+) -> None:
+    """Figures 4 and 5 by both schemes, and sweeps over two virtual devices."""
+    from .paper import figures, figures_table, montage, scaling, scaling_table
+    from .record import environment, write
+
+    records, pictures = [], []
+    for record, picture in figures(size, half_width, directions, pixels, _tell):
+        records.append(record)
+        pictures.append(picture)
+        write(json_file, _QUESTIONS["paper"], records, environment=environment())
+    shared = list(scaling(min(size, 64), half_width, directions, repeats, _tell))
+    write(json_file, _QUESTIONS["paper"], records + shared, environment=environment())
+    if out is not None:
+        import raymanifold_jax as rm
+
+        rm.io.write_png(out, montage(pictures))
+    _print_environment(environment())
+    click.echo(f"{figures_table(records)}\n\n{scaling_table(shared)}")
 
 
 def _check_quadrature(name: str) -> None:

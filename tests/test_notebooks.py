@@ -49,3 +49,45 @@ def test_fit_fog(monkeypatch):
     assert error[1.0] < 0.02
     assert max(error.values()) < 0.25
     assert all(f.values["medium.scattering"].min() >= 0 for f in names["found"].values())
+
+
+@pytest.mark.slow
+def test_quickstart(monkeypatch):
+    names = run("quickstart.ipynb", monkeypatch)
+    assert names["solution"].converged
+    assert np.array_equal(names["again"].fluence, names["solution"].fluence)
+    assert float(names["slopes"][0]) > 0
+
+
+@pytest.mark.slow
+def test_milk(monkeypatch):
+    # Thin milk is as blue as its scattering, (436 / 664)^-1.37 or 1.7 in eight bands; here in three of 463 to 637 nm.
+    names = run("milk.ipynb", monkeypatch)
+    blueness = names["blueness"]
+    assert blueness[1000] == pytest.approx((names["bands"].centres[0] / names["bands"].centres[-1]) ** names["power"], rel=0.05)
+    assert blueness[1000] > blueness[100] > blueness[10] > blueness[1] > 0.9
+    assert names["share"][1].max() < 0.5 < names["share"][100].min()
+
+
+@pytest.mark.slow
+def test_light_ray_manifold(monkeypatch):
+    names = run("light_ray_manifold.ipynb", monkeypatch)
+    np.testing.assert_allclose(names["radiance"], 1, atol=2e-5)
+    np.testing.assert_allclose(names["mean"], 1, atol=2e-5)
+    fluence = [float(np.nansum(s)) for s in names["slices"]]
+    assert fluence == sorted(fluence)
+
+
+@pytest.mark.slow
+def test_run_time_vs_error(monkeypatch):
+    names = run("run_time_vs_error.ipynb", monkeypatch)
+    assert all(names["rms"](r) < 20 for r in names["records"])
+    assert names["best"]["converged"]
+
+
+@pytest.mark.slow
+def test_pe_array(monkeypatch):
+    names = run("pe_array.ipynb", monkeypatch)
+    assert names["difference"] < 1e-6
+    assert len(names["path"]) > 1
+    assert {r["pe"] for r in names["shared"]} == {None, (1, 1), (2, 1)}
