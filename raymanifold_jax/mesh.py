@@ -208,6 +208,11 @@ class Mesh(Shape):
         apart = jnp.maximum(away + (_MARGIN - 1), at_side - away)
         return cell * jnp.where(away > 0, apart, at_side)
 
+    @property
+    def roughness(self) -> Any:
+        """Edges are rounded, and where parts of the mesh overlap its inside is not known well: over half a cell or so."""
+        return 0.6 * jnp.asarray(self.cell)
+
     def bounds(self) -> Bounds:
         return self.surface.vertices.min(0), self.surface.vertices.max(0)
 

@@ -18,6 +18,7 @@ Public names: `Shape`, `Sphere`, `Box`, `Torus`, `Cylinder`, `HalfSpace`, `Union
 """
 
 import abc
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -54,6 +55,13 @@ class Shape(eqx.Module):
 
         May be infinite, need not be tight, and may have lower > upper for an intersection of shapes that do not meet.
         """
+
+    @property
+    def roughness(self) -> Any:
+        """How far the surface that rays find may be from the shape's own; 0.0 where it is known exactly."""
+        parts = [part for value in vars(self).values() for part in (value if isinstance(value, tuple) else (value,))]
+        rough = [part.roughness for part in parts if isinstance(part, Shape)]
+        return functools.reduce(jnp.maximum, (r for r in rough if not isinstance(r, float)), 0.0) if rough else 0.0
 
     def union(self, *others: "Shape") -> "Union":
         """What lies in this shape or in any of `others`."""

@@ -14,6 +14,7 @@ Public: `Hit`, `first_hit`, `visible`; `trace_rays` for a block of rays; and `ma
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -122,25 +123,40 @@ def _sphere_trace(scene: Scene, axes: tuple[Axis, ...], start: Array, w: Array, 
     # Just past a plane between images, which side a point folds to must not be left to rounding.
     nudge = max(_TOUCH, 4 * precision * _PASSES)
 
+    bumps = _bumps(scene, start.dtype)
+
     def step(state):
-        t, near, done, count = state
+        t, near, done, free, count = state
         u = start + t[:, None] * w
         near = jnp.where(done, near, _distance(scene, fold(axes, u)[0] if folds else u))
-        ahead = jnp.maximum(near, _CRAWL)
+        ahead, surface = jnp.maximum(near, _CRAWL), touch
+        if bumps is not None:
+            ahead, surface = jnp.maximum(jnp.abs(near), _CRAWL), jnp.where(free, touch, -bumps)
+            free = free | (near > bumps)
         for i in folds:
             ahead = jnp.minimum(ahead, axes[i].to_fold(u[:, i], w[:, i]) + nudge)
-        stopped = done | (near < touch)
+        stopped = done | (near < surface)
         t = jnp.where(stopped, t, jnp.minimum(t + ahead, leave))
-        return t, near, stopped | (t >= leave), count + 1
+        return t, near, stopped | (t >= leave), free, count + 1
 
     # A start on a surface is past it: seen from behind, a flush solid does not stop the ray.
     first = jnp.full_like(leave, 2 * _CRAWL + (nudge if folds else 0.0))
-    state = (jnp.minimum(first, leave), jnp.full_like(leave, jnp.inf), leave <= 0, 0)
+    free = jnp.zeros(leave.shape, bool)
+    state = (jnp.minimum(first, leave), jnp.full_like(leave, jnp.inf), leave <= 0, free, 0)
     most = _STEPS * (8 if folds else 1)
-    t, near, done, _ = lax.while_loop(lambda s: ~s[2].all() & (s[3] < most), step, state)
+    t, near, done, free, _ = lax.while_loop(lambda s: ~s[2].all() & (s[4] < most), step, state)
+    surface = touch if bumps is None else jnp.where(free, touch, -bumps)
     # The least step may have led a little into the solid.
     t = t + jnp.clip(jnp.where(done, near, 0.0), -_CRAWL, 0.0)
-    return t, jnp.where(done, near < touch, near < _NEAR)
+    return t, jnp.where(done, near < surface, near < _NEAR)
+
+
+def _bumps(scene: Scene, dtype: Any) -> Array | None:
+    """In voxels, the depth to which a ray may cut through a solid until it is once as far from all solids: bumps of rough
+    surfaces (`Shape.roughness`) throw no shadows on what is between them. None: all surfaces are exact.
+    """
+    rough = [r for r in (solid.shape.roughness for solid in scene.solids) if not isinstance(r, float)]
+    return functools.reduce(jnp.maximum, rough).astype(dtype) / scene.lattice.spacing if rough else None
 
 
 def _side(scene: Scene, to_side: Array, direction: Array) -> tuple[Array, Array, Array]:
@@ -179,16 +195,20 @@ def visible_unfolded(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"
     # Points of elements may lie a little inside a curved solid: deeper than its ends a ray must not go.
     ends = jnp.minimum(distance(o), distance(e))
     deepest = jnp.clip(ends, -10 * _BEHIND, 0.0) - _CRAWL
+    bumps = _bumps(scene, o.dtype)
 
     def step(state):
-        t, blocked, count = state
+        t, blocked, free, count = state
         near = distance(o + t[:, None] * w)
         going = ~blocked & (t < stop)
-        return jnp.where(going, t + jnp.maximum(jnp.abs(near), _BEHIND), t), blocked | (going & (near < deepest)), count + 1
+        blocks = near < (deepest if bumps is None else jnp.where(free, deepest, deepest - bumps))
+        free = free if bumps is None else free | (near > bumps)
+        return jnp.where(going, t + jnp.maximum(jnp.abs(near), _BEHIND), t), blocked | (going & blocks), free, count + 1
 
     def goes_on(state):
-        t, blocked, count = state
+        t, blocked, _, count = state
         return (~blocked & (t < stop)).any() & (count < _STEPS)
 
-    _, blocked, _ = lax.while_loop(goes_on, step, (jnp.zeros_like(stop), jnp.zeros(stop.shape, bool), 0))
+    start = (jnp.zeros_like(stop), jnp.zeros(stop.shape, bool), jnp.zeros(stop.shape, bool), 0)
+    _, blocked, _, _ = lax.while_loop(goes_on, step, start)
     return jnp.where(blocked, 0.0, 1.0).astype(o.dtype)

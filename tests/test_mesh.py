@@ -6,6 +6,7 @@ them; elements are made of the triangles, so their areas are the mesh's (slivers
 
 import warnings
 
+import jax
 import numpy as np
 import problems
 import pytest
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 import raymanifold_jax as rm
 from raymanifold_jax.surfaces import find_surfaces
+from raymanifold_jax.trace import first_hit
 
 trimesh = pytest.importorskip("trimesh")
 
@@ -314,3 +316,41 @@ def test_masks_that_do_not_fit():
         rm.Voxels(np.ones((6, 6, 6)), lattice)
     with pytest.raises(ValueError, match="without a True"):
         rm.Voxels(np.zeros((6, 6, 6), bool), lattice)
+
+
+def test_bumps_where_parts_overlap_throw_no_shadows(monkeypatch):
+    """A ball sunk into a box, as one mesh: under a slanting sun, what the exact shapes leave lit is lit.
+
+    Inside, the distance is that to the sunk parts of the mesh; interpolated, that leaves dents along the seam.
+    """
+    ball = trimesh.creation.icosphere(3, 0.2).apply_translation((0.5, 0.5, 0.55))
+    box = trimesh.creation.box(bounds=[(0.2, 0.2, 0.2), (0.8, 0.8, 0.5)])
+    both = trimesh.util.concatenate([ball, box])
+    mesh = rm.Mesh(both.vertices, both.faces, resolution=40)
+    exact = rm.Sphere((0.5, 0.5, 0.55), 0.2).union(rm.Box((0.2, 0.2, 0.2), (0.8, 0.8, 0.5)))
+    lattice, to_sun = rm.Lattice((32, 32, 32), 1 / 32), np.array([0.8, 0.3, 0.52])
+    to_sun /= np.linalg.norm(to_sun)
+    grid = np.stack(np.meshgrid(*[(np.arange(96) + 0.5) / 96] * 2, indexing="ij"), -1).reshape(-1, 2)
+    above = np.column_stack([grid, np.full(len(grid), 0.99)])
+
+    def sunlit(scene, start):
+        return np.asarray(first_hit(scene, start, np.broadcast_to(to_sun, start.shape)).material) < 0
+
+    def lit(shape):
+        scene = rm.Scene(lattice, [rm.Solid(shape, 0.5)])
+        hit = first_hit(scene, above, np.broadcast_to((0.0, 0.0, -1.0), above.shape))
+        start = np.asarray(hit.point) + 1e-4 * np.asarray(hit.normal)
+        facing = (np.asarray(hit.material) == 0) & (np.asarray(hit.normal) @ to_sun > 0.1)
+        return facing, sunlit(scene, start), start, scene
+
+    facing, expected, _, _ = lit(exact)
+    near_edge = sum(expected != np.roll(expected.reshape(96, 96), shift, axis).ravel() for shift in (-1, 1) for axis in (0, 1))
+    clear = facing & expected & (near_edge == 0)
+    facing, found, start, scene = lit(mesh)
+    spots = lambda values: float((clear & facing & ~values).sum() / (clear & facing).sum())
+    assert spots(found) < 0.01
+    with monkeypatch.context() as patch:
+        patch.setattr(rm.Mesh, "roughness", 0.0)
+        jax.clear_caches()
+        assert spots(sunlit(scene, start)) > 0.02
+    jax.clear_caches()
