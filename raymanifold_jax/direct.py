@@ -140,7 +140,7 @@ def _from_sun(
     beam = Quadrature(np.tile(direction, (count, 1)), np.full(count, 1 / count), offsets, "sun")
     make = lambda: _beam_transport(layout, beam, materials.extinction, scene.bands)
     key = ("sun", *direction.tolist(), scene.bands, layout.shapes.mesh if isinstance(layout, Partition) else None)
-    transport = make() if prepared is None else prepared.transport(key, materials.extinction, make)
+    transport = make() if prepared is None else prepared.reuse(key, materials.extinction, make)
     images = layout.unfolding.images()
     irradiance = jnp.broadcast_to(sun.irradiance, (scene.bands,))
     # Only the scene itself is lit; a mirror image of it gets what mirrors reflect.

@@ -27,7 +27,7 @@ import numpy as np
 from .acceleration import Diffusion
 from .checkpoint import Checkpoint
 from .direct import Direct
-from .krylov import linear_solve
+from .krylov import combine, linear_solve
 from .operator import Light, Materials, Transport
 from .progress import Progress
 
@@ -188,6 +188,15 @@ class Iteration:
             arriving, residual, lost, residuals, target = found
             self.arriving, self.residual, self.lost = jax.tree.map(jnp.asarray, (arriving, residual, lost))
             self.residuals, self.target = [float(r) for r in residuals], float(target)
+
+    def start_from(self, leaving: Light) -> None:
+        """Begin with light that leaves, for one sweep, if that is nearer than none."""
+        arriving, again = self.system.bounce(leaving)
+        residual = combine([1, 1, -1], [self.system.materials.reflected(self.system.source), again, leaving])
+        if float(residual.largest()) < self.residuals[0]:
+            self.reach(arriving, residual)
+        else:
+            self.spend(1)
 
     def keep(self) -> None:
         """A place from which to go on: save the state if it is time."""

@@ -25,7 +25,7 @@ from .surfaces import Surfaces, find_surfaces
 
 
 class Prepared:
-    """Surfaces and layout of a geometry; `transport` keeps what was made for a medium while that stays the same."""
+    """Surfaces and layout of a geometry; `reuse` keeps what was made for some values while they stay the same."""
 
     def __init__(self, surfaces: Surfaces, layout: Layout):
         self.surfaces, self.layout = surfaces, layout
@@ -40,14 +40,18 @@ class Prepared:
             self._partitions[mesh] = make_partition(self.layout, mesh)
         return self._partitions[mesh]
 
-    def transport(self, key: Hashable, medium: Any, make: Callable[[], Any], alive: Any = None) -> Any:
-        """`make()`, or what it gave before for the same `key` and equal arrays of the `medium`.
+    def bare(self) -> Prepared:
+        """The same without what `reuse` keeps."""
+        return Prepared(self.surfaces, self.layout)
+
+    def reuse(self, key: Hashable, values: Any, make: Callable[[], Any], alive: Any = None) -> Any:
+        """`make()`, or what it gave before for the same `key` and equal arrays in `values`.
 
         `alive` is kept as well: an object whose id is part of the key.
         """
-        if checks.is_traced(medium):
+        if checks.is_traced(values):
             return make()
-        now = [known(jnp.asarray(leaf)) for leaf in jax.tree.leaves(medium)]
+        now = [known(jnp.asarray(leaf)) for leaf in jax.tree.leaves(values)]
         before, kept, _ = self._kept.get(key, ([], None, None))
         same = len(now) == len(before) and all(map(np.array_equal, now, before))
         if kept is None or not same:

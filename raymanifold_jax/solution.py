@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Mapping
 from html import escape
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,6 +19,10 @@ from jaxtyping import Float
 
 from .scene import Scene
 from .surfaces import Surfaces
+
+if TYPE_CHECKING:
+    from .prepare import Prepared
+    from .quadrature import Quadrature
 
 
 class SurfaceTable(NamedTuple):
@@ -57,6 +62,9 @@ class _Hidden:
     """Static data that jit compares by identity."""
 
     surfaces: Surfaces
+    prepared: Prepared | None = None
+    quadrature: Quadrature | None = None
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of the solve, for the next
 
     def __hash__(self) -> int:
         return id(self.surfaces)
@@ -100,6 +108,19 @@ class Solution(eqx.Module):
     rounding: float = eqx.field(static=True)
     no_bound: str = eqx.field(static=True)
     _hidden: _Hidden = eqx.field(static=True)
+
+    def resolve(self, scene: Scene, **options: Any) -> Solution:
+        """Solve for other lights, albedos, emissions or medium in the same geometry, from this solution on.
+
+        What depends on the geometry alone is not done again, and the iteration starts from this light; the directions, the
+        scheme and `rtol` stay what they were unless `options`, which are those of `rm.solve`, say otherwise. The first call
+        also keeps, for those that follow, what a solve otherwise lets go (who sees whom; see `rm.solve`, `prepared`).
+
+        **Raises** `ValueError` for a scene with another lattice, other shapes or other kinds of sides.
+        """
+        from .solve import resolve
+
+        return resolve(self, scene, options)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the solution and its scene to a file that `rm.load` reads; whole, or the old one stays.

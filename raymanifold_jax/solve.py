@@ -3,15 +3,17 @@
 The scene becomes surface elements and a layout for the sweeps; light straight from the sources is worked out once; bounced
 light is iterated to a certified bound (see `iteration`).
 
-Public: `solve`.
+Public: `solve`; `resolve` for `Solution.resolve`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Mapping
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +34,7 @@ from .placement import check_agreement, restored, stored
 from .prepare import Prepared, prepare
 from .progress import Progress, make_progress
 from .quadrature import Quadrature, for_scene
-from .scene import OPEN, PointLight, Scene, Sky, Sun
+from .scene import OPEN, PointLight, Scene, Sky, Sun, Wall
 from .sharding import check_mesh
 from .solution import Energy, Solution, _Hidden
 from .solvers import Anderson, Jacobi, Krylov, Orders, automatic
@@ -56,6 +58,7 @@ def solve(
     checkpoint: Checkpoint | None = None,
     prepared: Prepared | None = None,
     bounces: int | None = None,
+    start: Solution | None = None,
 ) -> Solution:
     """Solve a scene for the light everywhere.
 
@@ -82,6 +85,8 @@ def solve(
     - `bounces`: only light that surfaces and medium have sent on at most so many times before it arrives; `None`: all of it.
       With 0 it comes straight from the sources, and pictures show what surfaces and fog send on once: single scattering. The
       bound then tells how far that is from all the light. `solver` has no say.
+    - `start`: a solution of the same geometry whose light is near this one's, to begin with; `Solution.resolve` does that. Not
+      with `bounces`, a checkpoint, the paper's scheme, nor under JAX's transformations.
     - `mesh`: `rm.pe_array(nu, nv)` splits the lattice over devices (see `partition`). Results are the same to rounding. What
       needs no sweep is done on one device: the geometry, light straight from point lights and small emitters, readings of
       the solution. Not under `jit` and `vmap`.
@@ -91,6 +96,9 @@ def solve(
     with `throw`.
     """
     _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, checkpoint, prepared)
+    if start is not None:
+        _check_start(scene, start, bounces, checkpoint)
+    options = {"rtol": rtol, "scheme": scheme, "mesh": mesh}
     chosen = solver if bounces is None else _orders(bounces, scene, checkpoint)
     cube = scheme if isinstance(scheme, LightRayCube) else None
     quadrature = for_scene(scene) if quadrature is None else quadrature
@@ -98,6 +106,7 @@ def solve(
     meter = make_progress(progress)
     with meter:
         meter.start(f"solve {scene.summary()}")
+        kept = prepared is not None
         prepared = prepare(scene) if prepared is None else prepared
         surfaces = prepared.surfaces
         layout = prepared.layout_on(mesh if cube is None else None)
@@ -111,6 +120,7 @@ def solve(
             check_agreement("scene", numbers)
             check_agreement("scheme", np.frombuffer(repr(cube).encode(), np.uint8))
         nodes = None if cube is None else make_cube_system(scene, surfaces, cube, mesh)
+        again = None
         if nodes is not None:
             system, quadrature = nodes.system, nodes.quadrature
         else:
@@ -120,32 +130,87 @@ def solve(
                 layout, quadrature, own.extinction, scene.bands, area=area, albedo=own.scattering_albedo
             )
             key = (id(quadrature), scene.bands, area is None, mesh)
-            transport = prepared.transport(key, (stuff.extinction, stuff.scattering_albedo), make, quadrature)
+            transport = prepared.reuse(key, (stuff.extinction, stuff.scattering_albedo), make, quadrature)
             system = System(transport, own, first_flight(scene, surfaces, transport, quadrature, own, prepared))
-        iteration, chosen = _iterate(
-            system, surfaces if nodes is None else None, float(rtol), chosen, max_sweeps, meter, checkpoint
-        )
-        solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes, chosen)
+            # What speeds up and certifies the iteration is the same for other lights.
+            values = stop_gradient((stuff.albedo, stuff.scattering_albedo, stuff.extinction))
+            again = lambda make: prepared.reuse(("certificate", *key), values, make, quadrature)
+        first = None if start is None or nodes is not None else stored(layout, _sent(start, stuff))
+        iteration, chosen = _iterate(system, surfaces, again, float(rtol), chosen, max_sweeps, meter, checkpoint, first)
+        hidden = _Hidden(surfaces, prepared if kept else prepared.bare(), quadrature, options)
+        solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes, chosen, hidden)
     if throw and not solution.converged and solution.ending != "as asked":
         raise RuntimeError(f"solve: {solution.result}")
     return solution
 
 
+def resolve(solution: Solution, scene: Scene, options: Mapping[str, Any]) -> Solution:
+    """`Solution.resolve`."""
+    checks.instance("scene", scene, Scene, "make one with rm.Scene(lattice, solids=[...], ...)")
+    before = solution._hidden
+    given: dict[str, Any] = dict(before.options) | dict(options)
+    if given.get("scheme") is None or isinstance(given["scheme"], Characteristic):
+        given.setdefault("quadrature", before.quadrature)
+    if given.get("bounces") is None and given.get("checkpoint") is None:
+        given.setdefault("start", solution)
+    if not _same_geometry(solution.scene, scene):
+        got = "a scene of another geometry"
+        checks.fail("scene", got, "the lattice, shapes and kinds of sides that were solved", "use rm.solve(scene)")
+    given.setdefault("prepared", before.prepared)
+    return solve(scene, **given)
+
+
+def _same_geometry(one: Scene, other: Scene) -> bool:
+    kinds = lambda scene: [Wall if isinstance(side, Wall) else side for side in scene.boundary.sides]
+    shapes = lambda scene: [solid.shape for solid in scene.solids]
+    return kinds(one) == kinds(other) and bool(eqx.tree_equal((one.lattice, shapes(one)), (other.lattice, shapes(other))))
+
+
+def _check_start(scene: Scene, start: Solution, bounces: int | None, checkpoint: Checkpoint | None) -> None:
+    checks.instance("start", start, Solution, "pass what rm.solve returned")
+    if bounces is not None or checkpoint is not None:
+        checks.fail("start", "a solution, with bounces or a checkpoint", "None", "these begin with no light: leave it out")
+    if not _same_geometry(start.scene, scene):
+        checks.fail("start", "a solution of another geometry", "one of the scene's", "leave it out")
+
+
+def _sent(start: Solution, stuff: Materials) -> Light | None:
+    """What surfaces and medium would send of a solution's light; None if its bands are others."""
+    total = Light(
+        (start.diffuse_irradiance + start.sun_irradiance) / jnp.pi, (start.diffuse_fluence + start.sun_fluence) / (4 * jnp.pi)
+    )
+    if total.elements.shape != stuff.albedo.shape or checks.is_traced((total, stuff)):
+        return None
+    return stuff.reflected(total if stuff.scattering_albedo is not None else Light(total.elements))
+
+
 def _iterate(
-    system: Any, surfaces: Surfaces | None, rtol: float, solver: Any, most: int, meter: Progress, checkpoint: Checkpoint | None
-) -> tuple[Iteration | Unwatched, Any]:
-    """The iteration when it is over, and the solver it was left to. `surfaces` is None in the paper's scheme."""
+    system: Any, surfaces: Surfaces, again: Callable | None, rtol: float, solver: Any, most: int, meter: Progress,
+    checkpoint: Checkpoint | None, start: Light | None,
+) -> tuple[Iteration | Unwatched, Any]:  # fmt: skip
+    """The iteration when it is over, and the solver it was left to. `again` is None in the paper's scheme."""
     traced = checks.is_traced(system)
     known = stop_gradient(system) if traced else system
     if checks.is_traced(known):
         iteration, near = Unwatched(system, rtol, most), None
         solver = iteration.solver
     else:
-        near = None if surfaces is None else make_diffusion(known.transport, surfaces, known.materials)
+        fresh = []
+
+        def diffusion_and_certificate():
+            fresh.append(True)
+            near = None if again is None else make_diffusion(known.transport, surfaces, known.materials)
+            return near, certify(known if near is None else dataclasses.replace(known, near=near))
+
+        make = diffusion_and_certificate
+        near, certificate = make() if again is None or traced else again(make)
         known = known if near is None else dataclasses.replace(known, near=near)
+        certificate = certificate if fresh else dataclasses.replace(certificate, sweeps=0)
         if isinstance(solver, str):
             solver = Jacobi() if near is None else automatic(known, _depth(known.materials, known.transport.layout.spacing))
-        iteration = Iteration(known, certify(known), rtol, most, meter)
+        iteration = Iteration(known, certificate, rtol, most, meter)
+        if start is not None:
+            iteration.start_from(start)
         if checkpoint is not None:
             iteration.resume(checkpoint)
         solver.run(iteration)
@@ -245,6 +310,7 @@ def _finish(
     iteration: Iteration | Unwatched,
     nodes: CubeSystem | None,
     solver: object,
+    hidden: _Hidden,
 ) -> Solution:
     system, bounced = iteration.system, iteration.arriving
     # Within its bound a Krylov iterate may dip below 0, where the exact solution is not.
@@ -278,7 +344,7 @@ def _finish(
         history=math.pi * np.array(iteration.residuals[1:]), sweeps=iteration.sweeps + iteration.certificate.sweeps,
         ending=iteration.ending, solver=repr(solver), rounding=math.pi * iteration.rounding,
         no_bound=iteration.certificate.reason if iteration.residuals[-1] > 0 else "",
-        _hidden=_Hidden(surfaces),
+        _hidden=hidden,
     )  # fmt: skip
 
 
