@@ -128,6 +128,11 @@ def render(
     with one_line_errors():
         _start(settings["pe"])
         built = _build(scene, size, settings["directions"])
+        if scene.bands is None and built.bands not in (1, 3):
+            expected = "1 or 3 (R, G, B), or a table [bands] that tells their wavelengths"
+            raise ValueError(
+                f"{scene.name}: got values of {built.bands} bands, expected {expected}; write edges = [...] there, in nm"
+            )
         views = {view: make(built.lattice, resolution) for view, make in available.items()}
         solution, seconds = _solve(built, **settings)
 

@@ -43,7 +43,7 @@ def _scene_file(path: str) -> "SceneEntry":
     size = max(file.scene.lattice.shape)
     build = lambda n: file.scene if n == size else load_scene(path, n).scene
     views = file.cameras or STANDARD_VIEWS
-    return SceneEntry(file.path.stem, build, file.description or str(path), size, views)
+    return SceneEntry(file.path.stem, build, file.description or str(path), size, views, file.bands, file.white)
 
 
 class Resolution(click.ParamType):

@@ -62,9 +62,10 @@ class _Hidden:
     """Static data that jit compares by identity."""
 
     surfaces: Surfaces
-    prepared: Prepared | None = None
-    quadrature: Quadrature | None = None
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # of the solve, for the next
+    # For the next solve (`Solution.resolve`); not saved.
+    prepared: Prepared | None = dataclasses.field(default=None, metadata={"saved": False})
+    quadrature: Quadrature | None = dataclasses.field(default=None, metadata={"saved": False})
+    options: Mapping[str, Any] | None = dataclasses.field(default=None, metadata={"saved": False})
 
     def __hash__(self) -> int:
         return id(self.surfaces)
@@ -136,6 +137,12 @@ class Solution(eqx.Module):
         from .plots import plot_solution
 
         return plot_solution(self, at)
+
+    def view(self, height: int = 512) -> Any:
+        """A `k3d.Plot` to turn about in a notebook: radiosity on surfaces, fluence in the fog (`viewer`)."""
+        from .viewer import view_solution
+
+        return view_solution(self, height)
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""

@@ -148,7 +148,7 @@ def resolve(solution: Solution, scene: Scene, options: Mapping[str, Any]) -> Sol
     """`Solution.resolve`."""
     checks.instance("scene", scene, Scene, "make one with rm.Scene(lattice, solids=[...], ...)")
     before = solution._hidden
-    given: dict[str, Any] = dict(before.options) | dict(options)
+    given: dict[str, Any] = dict(before.options or {}) | dict(options)
     if given.get("scheme") is None or isinstance(given["scheme"], Characteristic):
         given.setdefault("quadrature", before.quadrature)
     if given.get("bounces") is None and given.get("checkpoint") is None:

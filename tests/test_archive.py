@@ -58,6 +58,7 @@ def test_a_solution_comes_back(solution, saved):
     points, normals = [[0.5, 0.5, 0.0], [0.9, 0.1, 0.0]], [[0, 0, 1], [0, 0, 1]]
     np.testing.assert_array_equal(rm.irradiance(back, points, normals, 64), rm.irradiance(solution, points, normals, 64))
     assert back.scene.summary() == solution.scene.summary()
+    assert back.resolve(back.scene).sweeps < solution.sweeps
 
 
 def test_what_cannot_be_saved(solution, tmp_path):
@@ -209,3 +210,19 @@ def test_kill_and_resume(tmp_path):
     assert run(checkpoint, tmp_path / "resumed.npy").wait() == 0
     assert run("-", tmp_path / "straight.npy").wait() == 0
     np.testing.assert_array_equal(np.load(tmp_path / "resumed.npy"), np.load(tmp_path / "straight.npy"))
+
+
+def test_view_shows_every_element_from_its_lit_side(solution):
+    pytest.importorskip("k3d")
+    plot = solution.view(height=300)
+    mesh = next(o for o in plot.objects if o.type == "Mesh")
+    table = solution.surfaces
+    vertices, triangles = np.asarray(mesh.vertices).reshape(-1, 3), np.asarray(mesh.indices).reshape(-1, 3)
+    a, b, c = (vertices[triangles[:, i]].astype(float) for i in range(3))
+    cross = np.cross(b - a, c - a).reshape(-1, 2, 3)
+    np.testing.assert_allclose(np.linalg.norm(cross, axis=-1).sum(1) / 2, table.areas, rtol=1e-3)
+    assert (np.einsum("eti,ei->et", cross, np.asarray(table.normals, float)) > 0).all()
+    brightest = int(np.argmax(np.asarray(table.radiosity).reshape(len(table.areas), -1).sum(1)))
+    assert np.asarray(mesh.colors)[4 * brightest] & 0xFF00 >= (np.asarray(mesh.colors) & 0xFF00).max() * 0.9
+    assert any(o.type == "Volume" for o in plot.objects) == (solution.scene.medium is not None)
+    assert "<html" in plot.get_snapshot().lower()

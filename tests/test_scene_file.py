@@ -162,6 +162,79 @@ def test_junk_is_no_scene(tmp_path_factory, junk):
         rm.io.load_scene(path)
 
 
+# Bands of wavelength
+
+BANDED = """\
+[bands]
+edges = [400, 460, 520, 580, 640, 700]
+[medium]
+scattering = { wavelengths = [400, 700], values = [2.0, 1.0], scale = 0.5 }
+[[lights]]
+kind = "sky"
+radiance = { illuminant = "D65", scale = 2.0 }
+[[lights]]
+kind = "sun"
+direction = [0, 0, -1]
+irradiance = { temperature = 5800 }
+[boundary]
+x = { albedo = { reflectance = "moderate red" } }
+"""
+
+
+def test_values_may_be_spectra(tmp_path):
+    file = load(tmp_path, SMALL + BANDED)
+    bands, scene = rm.spectra.Bands(edges=[400, 460, 520, 580, 640, 700]), file.scene
+    assert file.bands == bands and scene.bands == 5
+    np.testing.assert_allclose(scene.boundary.x.albedo, bands.reflectance("moderate red"), rtol=1e-5)
+    np.testing.assert_allclose(scene.lights[0].radiance, 2 * bands.illuminant("D65"), rtol=1e-5)
+    np.testing.assert_allclose(scene.lights[1].irradiance, bands.blackbody(5800), rtol=1e-5)
+    np.testing.assert_allclose(scene.medium.scattering, 0.5 * (2 - (bands.centres - 400) / 300), rtol=1e-5)
+    rm.io.save_scene(tmp_path / "again.toml", scene, bands=file.bands, white=file.white)
+    again = rm.io.load_scene(tmp_path / "again.toml")
+    assert again.bands == file.bands
+    np.testing.assert_allclose(again.white, file.white)
+    for a, b in zip(jax.tree.leaves(again.scene), jax.tree.leaves(scene), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("[bands]\nedges = [400, 460, 520, 580, 640, 700]\n", "", r"got a spectrum, expected wavelengths .* write \[bands\]"),
+        ('illuminant = "D65"', 'illuminant = "D651"', r"scene\.toml:11: lights\[0\]\.radiance: .*D65"),
+        ('illuminant = "D65"', 'illuminant = "D65", temperature = 5', "got illuminant and temperature, expected one of"),
+        ("temperature = 5800", "temperature = -1", "temperature: got"),
+        ("values = [2.0, 1.0]", "values = [2.0]", "as many increasing wavelengths as values"),
+        ("[400, 460, 520, 580, 640, 700]", "[700, 400]", "increasing wavelengths in nm"),
+        ("scale = 0.5", "scal = 0.5", "did you mean scale"),
+    ],
+)
+def test_spectra_that_are_wrong(tmp_path, old, new, message):
+    with pytest.raises(rm.io.SceneFileError, match=message):
+        load(tmp_path, (SMALL + BANDED).replace(old, new))
+
+
+def test_bands_that_no_value_has(tmp_path):
+    grey = SMALL + "[bands]\nedges = [400, 500, 600]\n[[lights]]\nkind = 'sky'\n"
+    with pytest.raises(rm.io.SceneFileError, match=r"bands: got values of 1 band, expected some of 2"):
+        load(tmp_path, grey)
+    with pytest.raises(ValueError, match="bands: got 2 of them, expected the scene's 1"):
+        rm.io.save_scene(tmp_path / "x.toml", load(tmp_path, SMALL).scene, bands=rm.spectra.Bands(edges=[400, 500, 600]))
+
+
+def test_command_line_with_bands(tmp_path):
+    path = write(tmp_path, SMALL + BANDED)
+    out = tmp_path / "out.exr"
+    arguments = ["--out", str(out), "--resolution", "8", "--directions", "24", "--quiet"]
+    result = CliRunner().invoke(cli.main, ["render", str(path), *arguments])
+    assert result.exit_code == 0, result.output
+    _, names, _ = rm.io.read_exr(out)
+    assert sum(name.startswith("S0.") for name in names) == 5 and "R" in names
+    path = write(tmp_path, SMALL + "[[lights]]\nkind = 'sky'\nradiance = [1, 2, 3, 4]\n")
+    result = CliRunner().invoke(cli.main, ["render", str(path), *arguments])
+    assert result.exit_code != 0 and "got values of 4 bands, expected 1 or 3" in result.output
+
+
 # Saving
 
 

@@ -141,4 +141,5 @@ def _decoded(tree: Any, arrays: dict[str, np.ndarray]) -> Any:
 
 
 def _fields(kind: type) -> tuple[str, ...]:
-    return getattr(kind, "_fields", None) or tuple(field.name for field in dataclasses.fields(kind))
+    saved = lambda field: field.metadata.get("saved", True)
+    return getattr(kind, "_fields", None) or tuple(field.name for field in dataclasses.fields(kind) if saved(field))

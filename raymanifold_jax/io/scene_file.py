@@ -1,8 +1,9 @@
 """Scene files: a scene and its cameras in TOML, read with an eye for mistakes.
 
 `raymanifold init` writes an example that says what there is. Lengths are numbers in the scene's unit, `lattice.length_unit`, or
-text with a unit of its own ("25 cm"); coefficients of media likewise ("0.3 /m"); angles are in degrees. Files named in a
-scene file are looked for beside it. Every error names the file, the line, the key, what was expected and the way out.
+text with a unit of its own ("25 cm"); coefficients of media likewise ("0.3 /m"); angles are in degrees. With a table [bands]
+values may be spectra: of colour science, or measured ones. Files named in a scene file are looked for beside it. Every error
+names the file, the line, the key, what was expected and the way out.
 
 Public names: `load_scene`, `SceneFile`, `SceneFileError`, `read_sky`.
 """
@@ -23,6 +24,7 @@ from ..lattice import Lattice
 from ..mesh import Mesh
 from ..scene import MIRROR, OPEN, PERIODIC, Boundary, Medium, PointLight, Scene, Sky, Solid, Sun, Wall
 from ..shapes import Box, Cylinder, HalfSpace, Shape, Sphere, Torus
+from ..spectra import Bands
 from ..voxels import Voxels
 from .exr import read_exr
 from .toml_table import LENGTHS, SceneFileError, Table, read_toml
@@ -49,12 +51,17 @@ Camera = Callable[[Lattice, tuple[int, int]], AbstractCamera]
 
 @dataclass(frozen=True)
 class SceneFile:
-    """What a scene file says: `scene`, and `cameras` by name as functions of (lattice, resolution)."""
+    """What a scene file says: `scene`, and `cameras` by name as functions of (lattice, resolution).
+
+    `bands`: the wavelengths of the scene's bands, if the file tells, and `white`, the band values that pictures show as white.
+    """
 
     path: Path
     scene: Scene
     cameras: Mapping[str, Camera] = field(repr=False)
     description: str = ""
+    bands: Bands | None = None
+    white: Any = field(default=None, repr=False)
 
 
 def load_scene(path: str | os.PathLike[str], size: int | None = None) -> SceneFile:
@@ -69,6 +76,8 @@ def load_scene(path: str | os.PathLike[str], size: int | None = None) -> SceneFi
     if version != FORMAT:
         raise top.fail("format", version, str(FORMAT), "newer files need a newer raymanifold")
     description = top.take("description", "", Table.text)
+    bands, white = _bands(top.table("bands")) if top.has("bands") else top.take("bands", (None, None))
+    top.source.bands = bands
     drawn, lattice = _lattice(top.table("lattice"), size)
     solids = [_solid(table, drawn) for table in top.tables("solids")]
     medium = _medium(top.table("medium"), lattice) if top.has("medium") else top.take("medium", None)
@@ -83,7 +92,25 @@ def load_scene(path: str | os.PathLike[str], size: int | None = None) -> SceneFi
     top.done()
     with top.checked():
         scene = Scene(lattice, solids, medium, lights, boundary)
-    return SceneFile(Path(path), scene, cameras, description)
+    if bands is not None and scene.bands != len(bands):
+        got = f"values of {scene.bands} band" + "s" * (scene.bands > 1)
+        raise top.fail(
+            "bands", got, f"some of {len(bands)}, as many as there are wavelengths", "give a spectrum, or leave it out"
+        )
+    return SceneFile(Path(path), scene, cameras, description, bands, white)
+
+
+def _bands(table: Table) -> tuple[Bands, Any]:
+    """The wavelengths, and the band values of white."""
+    edges, centres = table.take("edges", None, Table.numbers), table.take("centres", None, Table.numbers)
+    with table.checked():
+        bands = table.source.bands = Bands(edges=edges, centres=centres)
+    white = table.take("white", None, Table.numbers)
+    table.done()
+    with table.checked():
+        white = bands.illuminant("D65").tolist() if white is None else white
+        bands.rgb_matrix(white)  # what is wrong shows now
+    return bands, white
 
 
 def _lattice(table: Table, size: int | None) -> tuple[Lattice, Lattice]:

@@ -22,6 +22,7 @@ from ..lattice import Lattice
 from ..mesh import Mesh
 from ..scene import Medium, PointLight, Scene, Sky, Sun, Wall
 from ..shapes import Difference, Intersection, Rotated, Shape, Translated, Union
+from ..spectra import Bands
 from ..texture import Texture
 from ..voxels import Voxels
 from .exr import written_atomically
@@ -34,6 +35,11 @@ EXAMPLE = """\
 
 format = 1
 description = "two balls in thin fog under a sky"
+
+# [bands]                        # of wavelength, for other than R, G, B: values are then lists, one number a band, or spectra:
+#   edges = [400, 450, 500, 550, 600, 650, 700]  # nm; or centres      albedo = { reflectance = "moderate red" }
+#   white = { illuminant = "D65" } # what pictures show as white       irradiance = { temperature = 5800, scale = 3.0 }
+#                                # measured ones: scattering = { wavelengths = [400, 700], values = [2.0, 1.2] }
 
 [lattice]                        # the box, cut into cubes
 shape = [48, 48, 48]             # cubes along x, y, z; z is up
@@ -108,9 +114,16 @@ field_of_view = 34
 
 
 def save_scene(
-    path: str | os.PathLike[str], scene: Scene, cameras: Mapping[str, AbstractCamera] | None = None, description: str = ""
+    path: str | os.PathLike[str],
+    scene: Scene,
+    cameras: Mapping[str, AbstractCamera] | None = None,
+    description: str = "",
+    bands: Bands | None = None,
+    white: Any = None,
 ) -> None:
     """Write `scene` and `cameras` as a scene file that `load_scene` reads back to the same scene; lengths are in metres.
+
+    `bands`: the wavelengths of the scene's bands; with them `white`, the band values that pictures show as white, D65 if None.
 
     **Raises** `ValueError` for what a file cannot hold (skies that are functions, shapes of one's own); `FileNotFoundError`
     if the directory is missing.
@@ -119,9 +132,14 @@ def save_scene(
     path = Path(path)
     if path.suffix.lower() != ".toml":
         checks.fail("path", repr(str(path)), "a name that ends in .toml", f"write {str(path) + '.toml'!r}")
+    if bands is not None and len(bands) != scene.bands:
+        checks.fail("bands", f"{len(bands)} of them", f"the scene's {scene.bands}", "leave them out for R, G, B")
     lattice = scene.lattice
     writer = _Writer(path, lattice)
     out = [f"format = {FORMAT}"] + ([f"description = {_value(description)}"] if description else [])
+    if bands is not None:
+        shown = {"illuminant": "D65"} if white is None else np.asarray(white, float).tolist()
+        out += _block("[bands]", {"edges": list(bands.edges), "white": shown})
     out += _block("[lattice]", {"shape": list(lattice.shape), "spacing": lattice.spacing, "origin": list(lattice.origin)})
     sides = [
         {"albedo": _albedo(side.albedo), "emission": _plain(side.emission)}

@@ -15,6 +15,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from ..spectra import Bands
+
 #: Lengths in metres.
 LENGTHS = {"km": 1e3, "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "in": 0.0254, "ft": 0.3048}
 _ANGLES = {"deg": math.pi / 180, "rad": 1.0}
@@ -117,8 +119,38 @@ class Table:
         return value
 
     def numbers(self, key: str, value: Any) -> Any:
-        """A number, or a list of them."""
+        """A number, a list of them, or a spectrum."""
+        if isinstance(value, dict):
+            return self.spectrum(key, value)
         return [self.number(key, v) for v in value] if isinstance(value, list) and value else self.number(key, value)
+
+    def spectrum(self, key: str, value: dict[str, Any]) -> list[float]:
+        """A number for each of the file's bands of wavelength: of a known spectrum, or of a measured one."""
+        bands = self.source.bands
+        if bands is None:
+            advice = "write [bands] and below edges = [400, 500, 600, 700], in nm"
+            raise self.fail(key, "a spectrum", "wavelengths for its bands", advice)
+        table = Table(value, (*self.path, key), self.source)
+        kinds = [name for name in ("reflectance", "illuminant", "temperature", "wavelengths") if table.has(name)]
+        scale = table.take("scale", 1.0, Table.number)
+        if len(kinds) != 1:
+            expected = "one of reflectance, illuminant, temperature, or wavelengths with values"
+            raise table.fail(None, " and ".join(kinds) or "none of them", expected, 'write { illuminant = "D65", scale = 2.0 }')
+        with table.checked():
+            if kinds[0] == "wavelengths":
+                found = bands.mean(table.take("wavelengths", read=Table._list), table.take("values", read=Table._list))
+            elif kinds[0] == "temperature":
+                found = bands.blackbody(table.take("temperature", read=Table.number))
+            else:
+                found = getattr(bands, kinds[0])(table.take(kinds[0], read=Table.text))
+        table.known += ["reflectance", "illuminant", "temperature", "wavelengths", "values"]
+        table.done()
+        return [float(scale * v) for v in found]
+
+    def _list(self, key: str, value: Any) -> list[float]:
+        if not (isinstance(value, list) and value):
+            raise self.fail(key, value, "a list of numbers", f"write {key} = [400, 700]")
+        return [self.number(key, v) for v in value]
 
     def vector(self, key: str, value: Any) -> list[float]:
         return self._triple(key, value, self.number)
@@ -137,7 +169,9 @@ class Table:
         return math.radians(self.number(key, value))
 
     def per_length(self, key: str, value: Any) -> Any:
-        """A number or a list of them, per length."""
+        """A number or a list of them, per length; or a spectrum."""
+        if isinstance(value, dict):
+            return self.spectrum(key, value)
         if isinstance(value, list) and value:
             return [self._per_length(key, v) for v in value]
         return self._per_length(key, value)
@@ -164,11 +198,12 @@ class Table:
 
 
 class Source:
-    """A file: its name, the lines of its keys, and its unit of length in metres."""
+    """A file: its name, the lines of its keys, its unit of length in metres, and its bands of wavelength, if it has any."""
 
     def __init__(self, name: str, folder: Path, lines: dict[Path_, int]):
         self.name, self.folder, self.lines = name, folder, lines
         self.unit = 1.0
+        self.bands: Bands | None = None
 
     def at(self, path: Path_) -> str:
         while path and path not in self.lines:
