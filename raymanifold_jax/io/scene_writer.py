@@ -259,9 +259,15 @@ def _albedo(value: Any) -> Any:
 def _plain(value: Any) -> Any:
     array = np.asarray(value)
     if array.dtype == np.float32:
-        # The shortest decimals that come back as the same number in single precision.
-        return [float(str(x)) for x in array] if array.ndim else float(str(array[()]))
+        return [_shortest(x) for x in array] if array.ndim else _shortest(array[()])
     return array.astype(float).tolist()
+
+
+def _shortest(value: np.float32) -> float:
+    """The shortest decimals that come back as the same number in single precision."""
+    # Not str(value), which numpy's print options may cut short.
+    tries = (float(f"{value:.{digits}g}") for digits in range(6, 10))
+    return next((t for t in tries if np.float32(t) == value), float(value))
 
 
 def _block(header: str, rows: Mapping[str, Any]) -> list[str]:
