@@ -71,6 +71,12 @@ def main() -> None:
     help="N views from all around, as FILE-000.exr and so on: one solve, a film.",
 )
 @click.option(
+    "--fly-through",
+    type=click.IntRange(2, 9999),
+    metavar="N",
+    help="N views on a smooth path through the scene's perspective cameras, as FILE-000.exr and so on.",
+)
+@click.option(
     "--resolution", type=Resolution(), default="512", metavar="WxH", show_default=True, help="Pixels: 640x480, or 512."
 )
 @click.option(
@@ -103,6 +109,7 @@ def render(
     camera: str | None,
     all_views: bool,
     turntable: int | None,
+    fly_through: int | None,
     resolution: tuple[int, int],
     samples: int,
     exposure: float | None,
@@ -111,14 +118,16 @@ def render(
     **settings: Any,
 ) -> None:
     """Solve SCENE (ring, three-balls, room, cornell-box or a file.toml) and write pictures of it."""
-    if (camera is not None) + all_views + (turntable is not None) > 1:
-        raise click.UsageError("--camera, --all-views and --turntable exclude each other; leave all but one out", ctx)
+    film = turntable is not None or fly_through is not None
+    if sum(given is not None for given in (camera, turntable, fly_through)) + all_views > 1:
+        names = "--camera, --all-views, --turntable and --fly-through"
+        raise click.UsageError(f"{names} exclude each other; leave all but one out", ctx)
     if camera is not None and camera not in scene.views:
         got = f"--camera: got {camera!r}, expected one of {', '.join(scene.views)}"
         raise click.UsageError(f"{got}; leave it out for {next(iter(scene.views))!r}", ctx)
     out = Path(f"{scene.name}.exr") if out is None else out
-    available = scene.views if turntable is None else _turntable(turntable)
-    several = all_views or turntable is not None
+    available = _film(scene.views, turntable, fly_through, ctx) if film else scene.views
+    several = all_views or film
     wanted = list(available) if several else [camera or next(iter(available))]
     files = {view: out.with_stem(f"{out.stem}-{view}") if several else out for view in wanted}
     for file in files.values():
@@ -279,10 +288,15 @@ def _start(pe: tuple[int, int] | None) -> None:
         rm.pe_array(*pe)
 
 
-def _turntable(frames: int) -> "Mapping[str, View]":
-    from .scenes import turntable
+def _film(views: "Mapping[str, View]", around: int | None, through: int | None, ctx: click.Context) -> "Mapping[str, View]":
+    from .scenes import fly_through, turntable
 
-    return turntable(frames)
+    if around is not None:
+        return turntable(around)
+    try:
+        return fly_through(views, through or 0)
+    except ValueError as error:
+        raise click.UsageError(f"--fly-through: {error}", ctx) from error
 
 
 def _build(entry: "SceneEntry", size: int, directions: int) -> "Scene":

@@ -24,6 +24,8 @@ from functools import partial
 from types import MappingProxyType
 from typing import Any, TypeAlias
 
+import numpy as np
+
 from . import checks
 from .camera import AbstractCamera, OrthographicCamera, PerspectiveCamera, Vector
 from .cornell_box import camera_frame, cornell_box, default_bands, light_values
@@ -176,6 +178,38 @@ def turntable(frames: int, elevation: float = 35.0) -> dict[str, View]:
         checks.fail("elevation", repr(elevation), "degrees from 0 to 90", "35 looks down into an open box")
     digits = max(3, len(str(frames - 1)))
     return {f"{i:0{digits}d}": partial(_oblique, 360 * i / frames - 90, elevation, turning=True) for i in range(frames)}
+
+
+def fly_through(views: Mapping[str, View], frames: int) -> dict[str, View]:
+    """Views along a smooth path through the perspective `views`, in their order, "000" the first of them.
+
+    Places, targets, what is up and fields of view follow cubic splines, in equal times from view to view.
+
+    **Raises** `TypeError` or `ValueError` for fewer than two views or frames; a view's camera that is no perspective is found
+    when it is made.
+    """
+    frames = checks.positive_int("frames", frames, at_least=2)
+    if len(views) < 2:
+        checks.fail("views", f"{len(views)} of them", "at least two to fly between", "add perspective cameras to the scene")
+    digits = max(3, len(str(frames - 1)))
+    made = tuple(views.items())
+    return {f"{i:0{digits}d}": partial(_on_the_way, made, i / (frames - 1)) for i in range(frames)}
+
+
+def _on_the_way(
+    views: tuple[tuple[str, View], ...], share: float, lattice: Lattice, resolution: Resolution
+) -> PerspectiveCamera:
+    """The camera at a share of the path through some views."""
+    from scipy.interpolate import CubicSpline
+
+    stops = []
+    for name, make in views:
+        camera = make(lattice, resolution)
+        if not isinstance(camera, PerspectiveCamera):
+            checks.fail("views", f"{name!r}, a {type(camera).__name__}", "perspective cameras", "leave it out of the flight")
+        stops.append([*camera.position, *camera.target, *camera.up, camera.field_of_view])
+    at = CubicSpline(np.arange(len(stops)), np.array(stops), bc_type="natural")(share * (len(stops) - 1))
+    return PerspectiveCamera(at[:3], at[3:6], at[6:9], float(np.clip(at[9], 1.0, 170.0)), resolution)
 
 
 def _oblique(

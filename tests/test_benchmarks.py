@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import problems
 import pytest
+from click.testing import CliRunner
 from PIL import Image
 from problems.case import Target, joined, readings
 

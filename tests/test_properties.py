@@ -103,6 +103,7 @@ WORDS = st.one_of(
 )
 OPTIONS = [
     "--size", "--directions", "--rtol", "--resolution", "--samples", "--exposure", "--camera", "--turntable", "--all-views",
+    "--fly-through",
     "--out", "--half", "--layers", "--quiet", "--checkpoint", "--resume", "--save", "--pe", "--half-width",
     "--characteristic", "--force",
 ]  # fmt: skip

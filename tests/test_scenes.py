@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import raymanifold_jax as rm
 from raymanifold_jax import OPEN, Lattice, OrthographicCamera, Sun, Wall, memory, scenes
 
 names = pytest.mark.parametrize("name", scenes.SCENES)
@@ -184,3 +185,23 @@ def test_turntable_goes_once_around_and_keeps_the_scene_in_view():
 def test_turntable_refuses(frames, elevation):
     with pytest.raises((TypeError, ValueError), match="expected"):
         scenes.turntable(frames, elevation)
+
+
+def test_a_flight_goes_through_the_views():
+    lattice = rm.Lattice((8, 8, 8), 1 / 8)
+    eyes = [(0.5, -2.0, 0.5), (2.0, 0.5, 1.0), (0.5, 3.0, 0.5)]
+    views = {
+        f"v{i}": lambda _, r, eye=eye: rm.PerspectiveCamera(eye, (0.5, 0.5, 0.4), resolution=r) for i, eye in enumerate(eyes)
+    }
+    frames = scenes.fly_through(views, 9)
+    assert list(frames) == [f"{i:03d}" for i in range(9)]
+    cameras = [make(lattice, (12, 8)) for make in frames.values()]
+    for i, eye in zip((0, 4, 8), eyes, strict=True):
+        np.testing.assert_allclose(cameras[i].position, eye, atol=1e-12)
+    np.testing.assert_allclose([c.target for c in cameras], np.broadcast_to((0.5, 0.5, 0.4), (9, 3)), atol=1e-12)
+    steps = np.linalg.norm(np.diff([c.position for c in cameras], axis=0), axis=1)
+    assert steps.max() < 1.5 * steps.min()
+    with pytest.raises(ValueError, match="views: got 1 of them, expected at least two"):
+        scenes.fly_through({"one": views["v0"]}, 9)
+    with pytest.raises(ValueError, match="expected perspective cameras"):
+        scenes.fly_through(scenes.find("ring").views, 3)["000"](lattice, (8, 8))
