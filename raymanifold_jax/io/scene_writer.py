@@ -263,7 +263,7 @@ def _plain(value: Any) -> Any:
     return array.astype(float).tolist()
 
 
-def _shortest(value: np.float32) -> float:
+def _shortest(value: Any) -> float:
     """The shortest decimals that come back as the same number in single precision."""
     # Not str(value), which numpy's print options may cut short.
     tries = (float(f"{value:.{digits}g}") for digits in range(6, 10))
