@@ -3,14 +3,14 @@
 A sweep is a sum over directions. XLA splits every step of it over the cores and waits for all of them before the next; a part
 of the directions a core, each going through its planes by itself, takes 1.4 to 1.8 times less time on two cores.
 
-Public: `sum_over_cores`, `each_on_a_core`, `count_cores`.
+Public: `sum_over_cores`, `each_on_a_core`, `on_cores`, `count_cores`, `on_cpu`.
 """
 
 from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -35,7 +35,7 @@ def sum_over_cores(program: Callable, statics: tuple, layout: Any, ordinates: tu
     count = min(count_cores(), max(o.weight.shape[0] for o in ordinates))
     if count < 2 or not isinstance(layout, Layout) or checks.is_traced((ordinates, arguments)):
         return whole(ordinates)
-    if not _on_cpu(ordinates) or _steps(layout, ordinates) < _FEW:
+    if not on_cpu(ordinates) or _steps(layout, ordinates) < _FEW:
         return whole(ordinates)
     parts = _parts(ordinates, count)
     return _total(each_on_a_core(whole, parts, program, statics, layout, parts[0], arguments))
@@ -50,6 +50,11 @@ def each_on_a_core(function: Callable, arguments: Sequence[Any], *program: Any) 
         return [function(argument) for argument in arguments]
     long = jnp.zeros(0).dtype == np.float64
     return list(_pool().map(functools.partial(_as_here, long, function), arguments))
+
+
+def on_cores(function: Callable, parts: Sequence[Any]) -> Iterator[Any]:
+    """function(part) of each part, in order, at once. For code that knows nothing of JAX and holds no lock."""
+    return _pool().map(function, parts) if len(parts) > 1 else map(function, parts)
 
 
 def _as_here(x64: bool, function: Callable, argument: Any) -> Any:
@@ -68,7 +73,7 @@ def count_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _on_cpu(ordinates: tuple[Ordinates, ...]) -> bool:
+def on_cpu(ordinates: tuple[Ordinates, ...]) -> bool:
     return all(device.platform == "cpu" for device in ordinates[0].weight.devices())
 
 

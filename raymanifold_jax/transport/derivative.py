@@ -26,6 +26,7 @@ from .. import checks
 from ..adjoint import with_adjoint
 from ..layout import Layout, Ordinates
 from ..partition import Partition
+from . import native
 from .characteristic import Inflow, SweptMedium
 from .cores import sum_over_cores
 from .sharded import adjoint_over, sweep_over
@@ -180,14 +181,22 @@ def _medium(manner: Manner, layout: Layout | Partition, extinction, source, slop
 
 
 def _sweep(manner: Manner, *arguments) -> Results:
+    if native.serves(*arguments[:2], arguments[2:]):
+        return native.sweep(manner, *arguments)
     return sum_over_cores(_sweep_program, (manner,), *arguments)
 
 
 def _unsweep(manner: Manner, sloped: bool, *arguments) -> Sent:
+    if native.serves(*arguments[:2], arguments[2:]):
+        return native.unsweep(manner, *arguments, sloped)
     return sum_over_cores(_unsweep_program, (manner, sloped), *arguments)
 
 
-def _adjoint(manner: Manner, whole: bool, *arguments) -> Adjoint:
+def _adjoint(manner: Manner, whole: bool, layout, ordinates, extinction, weights: Results, sent: Sent, inflow) -> Adjoint:
+    arguments = layout, ordinates, extinction, weights, sent, inflow
+    if not whole and inflow is None and native.serves(*arguments[:2], arguments[2:]):
+        found = native.unsweep(manner, layout, ordinates, extinction, *weights, sent[2] is not None)
+        return Adjoint(*found, None, None, None)
     return sum_over_cores(_adjoint_program, (manner, whole), *arguments)
 
 

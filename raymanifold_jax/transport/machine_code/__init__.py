@@ -1,0 +1,34 @@
+"""The steps of the characteristic scheme as loops for one core of a CPU, compiled by numba.
+
+The equations are those of `characteristic`, where they are explained; here is how they are laid out. A core takes some
+directions through all planes, a few at a time so that their rays stay in its cache. In most voxels a segment is a loop over
+the whole plane, without a branch, that moves the rays on the way: the ray that is in voxel i now was in voxel i - move before.
+Voxels that a surface cuts, and ghost voxels at the rim, are few: they are listed, and overwrite what that loop left there.
+Segments of no length are left out; where the extinction is the same all over a plane, so are the exponentials.
+
+Numbers of whole planes are of the fields' own type; those of elements are worked out in 64 bits.
+
+numba keeps what it has compiled, by the time stamp of the file that holds the outermost function: after a change in another
+file here, touch `evolution.py`.
+
+Public: `forwards`, `backwards`, and the tuples that they take.
+"""
+
+from .arguments import EVEN, PATCHY, UNEVEN, Cells, Light, Manner, Planes, Readers, Segments, Ways, Work
+from .evolution import backwards, forwards
+
+__all__ = [
+    "EVEN",
+    "PATCHY",
+    "UNEVEN",
+    "Cells",
+    "Light",
+    "Manner",
+    "Planes",
+    "Readers",
+    "Segments",
+    "Ways",
+    "Work",
+    "backwards",
+    "forwards",
+]

@@ -1,0 +1,106 @@
+"""What the loops take: arrays of numpy, by name."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+UNEVEN, EVEN, PATCHY = 0, 1, 2
+
+
+class Ways(NamedTuple):
+    """Directions along one axis, (axis, u, v) each; `sense` +-1 tells which way the planes are passed."""
+
+    weight: Any  # [N]
+    toward: Any  # [N, 3]
+    slope: Any  # [N, 2]
+    start: Any  # [N, 2]
+    sense: Any  # [N]
+    laps: Any  # [N]
+    index: Any  # [N] in the quadrature
+
+
+class Planes(NamedTuple):
+    """The lattice as K planes of `height` x `width` voxels along one axis, but for the surfaces in it."""
+
+    height: int
+    width: int
+    wrap_v: bool
+    spacing: float
+    even: Any  # [K, C] EVEN: all voxels but the listed ones have the extinction `depth`; PATCHY: that or none; else UNEVEN
+    depth: Any  # [K, C]
+    extinction: Any  # [K, C, P], or nothing where all planes are even
+
+
+class Cells(NamedTuple):
+    """Listed voxels, plane by plane: those of plane k are first[k] to first[k + 1]."""
+
+    first: Any  # [K + 1]
+    cell: Any  # [J] flat in the plane
+    plane: Any  # [4, J] offset and normal of its surface; ghosts: nothing
+    extinction: Any  # [C, J]
+    image: Any  # [J] of ghosts that are open: their mirror image, else -1
+
+
+class Readers(NamedTuple):
+    """Elements that read voxels (see `layout.Reads`), plane by plane, in runs that have the same surface."""
+
+    runs: Any  # [K + 1] runs of plane k: runs[k] to runs[k + 1]
+    first: Any  # [R + 1] readers of run r: first[r] to first[r + 1]
+    face: Any  # [4, R]
+    height: Any  # [R]
+    cut: Any  # [R] number of the voxel among the CUT ones, -1 where it is none
+    cell: Any  # [M]
+    element: Any  # [M]
+    bits: Any  # [N, M / 8] whether it reads in a direction
+    even: Any  # [C, R] whether all of the run have the extinction `depth`
+    depth: Any  # [C, R]
+    extinction: Any  # [C, M] of the voxel
+
+
+class Light(NamedTuple):
+    """What is sent (forwards), or asked back of it (backwards)."""
+
+    source: Any  # [K, C, P]
+    slopes: Any  # 3 times that, or nothing
+    cut: Any  # [C, J] exitance of CUT voxels
+    ghost: Any  # [C, J] and of ghosts
+    radiance: Any  # [images, n, C] that enters
+    factor: Any  # [C, J] of ghosts: what that is multiplied by
+
+
+class Manner(NamedTuple):
+    """`thin`, `onward` as in `SweptMedium`; `limit` is `thin_limit`; `rows`: directions taken at a time."""
+
+    medium: bool
+    sloped: bool
+    thin: bool
+    onward: bool
+    fluence: bool
+    limit: float
+    rows: int
+
+
+class Segments(NamedTuple):
+    """Where the rays of a direction are on their way through a plane."""
+
+    share: Any  # [3]
+    begin: Any  # [3, 3]
+    end: Any  # [3, 3]
+    move: Any  # [3]
+    step: Any  # [3]
+    row: Any  # [4] of the rays before each segment and after the last
+
+
+class Work(NamedTuple):
+    """A core's own memory, of any content."""
+
+    rows: Any  # [rows + 4, P + 2 width] rays, both ends joined
+    nowhere: Any  # [P]
+    asked: Any  # [3, P] of the rays before each segment (backwards)
+    here: Any  # [12, most CUT voxels in a plane]
+    own: Any  # [rows] which row holds the rays of each direction
+    free: Any  # [4] rows that hold none
+    point: Any  # [3]
+    whole: Any  # [3]
+    form: Any  # [8]
+    way: Any  # Segments

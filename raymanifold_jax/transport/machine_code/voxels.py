@@ -1,0 +1,212 @@
+"""One segment of a direction's rays through a plane: the voxels that are free, those that surfaces cut, and ghosts."""
+
+from __future__ import annotations
+
+from .arguments import EVEN, PATCHY
+from .paths import attenuation, bend_of, compiled, exp, mean_of, middle_and_whole
+
+
+@compiled
+def through_even(before, after, source, sums, tau, limit, weight):
+    real = before.dtype.type
+    kept, mean, _ = attenuation(tau, False, limit)
+    mean, w = real(mean), real(weight)
+    if tau < limit:
+        lost = real(tau) * mean
+        for i in range(len(after)):
+            excess = before[i] - source[i]
+            after[i] = before[i] - lost * excess
+            sums[i] += w * (source[i] + mean * excess)
+    else:
+        kept = real(kept)
+        for i in range(len(after)):
+            excess = before[i] - source[i]
+            after[i] = source[i] + kept * excess
+            sums[i] += w * (source[i] + mean * excess)
+
+
+@compiled
+def through_patchy(before, after, source, sums, extinction, depth, length, limit, weight):
+    """Where the extinction is `depth` or none."""
+    real = before.dtype.type
+    kept, mean, _ = attenuation(depth * length, False, limit)
+    lost = depth * length * mean if depth * length < limit else 1 - kept
+    lost, spent, w = real(lost / depth), real((1 - mean) / depth), real(weight)
+    for i in range(len(after)):
+        excess = before[i] - source[i]
+        after[i] = before[i] - lost * extinction[i] * excess
+        sums[i] += w * (before[i] - spent * extinction[i] * excess)
+
+
+@compiled
+def through_void(before, after, sums, weight):
+    w = before.dtype.type(weight)
+    for i in range(len(after)):
+        after[i] = before[i]
+        sums[i] += w * before[i]
+
+
+@compiled
+def through_thin(before, after, source, sums, extinction, length, weight):
+    real = before.dtype.type
+    length, w = real(length), real(weight)
+    for i in range(len(after)):
+        tau = extinction[i] * length
+        excess = mean_of(tau) * (before[i] - source[i])
+        after[i] = before[i] - tau * excess
+        sums[i] += w * (source[i] + excess)
+
+
+@compiled
+def through_mixed(before, after, source, sums, extinction, length, limit, weight):
+    real = before.dtype.type
+    length, w, limit, one = real(length), real(weight), real(limit), real(1)
+    for i in range(len(after)):
+        tau = extinction[i] * length
+        kept, excess = exp(-tau), before[i] - source[i]
+        thin = tau < limit
+        mean = mean_of(tau) if thin else (one - kept) / max(tau, limit)
+        after[i] = before[i] - tau * mean * excess if thin else source[i] + kept * excess
+        sums[i] += w * (source[i] + mean * excess)
+
+
+@compiled
+def through_sloped(before, after, source, slopes, sums, point, step, even, depth, extinction, length, limit, weight):
+    """The same where the source is linear: point and step are the path's middle from the voxel's, and its whole."""
+    real = before.dtype.type
+    e0, e1, e2 = real(point[0]), real(point[1]), real(point[2])
+    s0, s1, s2 = real(step[0]), real(step[1]), real(step[2])
+    w, slope0, slope1, slope2 = real(weight), slopes[0], slopes[1], slopes[2]
+    if even:
+        kept, mean, bend = attenuation(depth * length, False, limit)
+        lost, kept, mean, onto, bend = real(1 - kept), real(kept), real(mean), real(depth * length * bend), real(bend)
+        thin = depth * length < limit
+        if thin:
+            lost = real(depth * length) * mean
+        for i in range(len(after)):
+            off = slope0[i] * e0 + slope1[i] * e1 + slope2[i] * e2
+            rise = slope0[i] * s0 + slope1[i] * s1 + slope2[i] * s2
+            excess = before[i] - (source[i] + off)
+            after[i] = (before[i] - lost * excess if thin else source[i] + off + kept * excess) + onto * rise
+            sums[i] += w * (source[i] + mean * excess - bend * rise)
+        return
+    length, limit, one, half = real(length), real(limit), real(1), real(0.5)
+    for i in range(len(after)):
+        off = slope0[i] * e0 + slope1[i] * e1 + slope2[i] * e2
+        rise = slope0[i] * s0 + slope1[i] * s1 + slope2[i] * s2
+        tau = extinction[i] * length
+        kept, excess = exp(-tau), before[i] - (source[i] + off)
+        thin, thick = tau < limit, max(tau, limit)
+        mean = mean_of(tau) if thin else (one - kept) / thick
+        bend = bend_of(tau) if thin else (half * (one + kept) - (one - kept) / thick) / thick
+        end = before[i] - tau * mean * excess if thin else source[i] + off + kept * excess
+        after[i] = end + tau * bend * rise
+        sums[i] += w * (source[i] + mean * excess - bend * rise)
+
+
+@compiled
+def through_cut(cells, k, c, number, way, length, before, after, margin, light, manner, here, weight):
+    """What surfaces make of one segment in the voxels that they cut; `here`: what is sent there, and what is summed."""
+    begun, count = cells.first[k], cells.first[k + 1] - cells.first[k]
+    real = before.dtype.type
+    cell, emitted = cells.cell[begun : begun + count], light.cut[c, begun : begun + count]
+    p0, p1 = cells.plane[0, begun : begun + count], cells.plane[1, begun : begun + count]
+    p2, p3 = cells.plane[2, begun : begun + count], cells.plane[3, begun : begun + count]
+    e0, e1, e2 = real(way.begin[number, 0]), real(way.begin[number, 1]), real(way.begin[number, 2])
+    s0, s1, s2 = real(way.step[0]), real(way.step[1]), real(way.step[2])
+    share, w, tiny, zero, one, half = real(way.share[number]), real(weight), real(1e-20), real(0), real(1), real(0.5)
+    rays, sums = here[0, :count], here[1, :count]
+    for j in range(count):
+        rays[j] = before[margin - way.move[number] + cell[j]]
+    if not manner.medium:
+        for j in range(count):
+            slope = p1[j] * s0 + p2[j] * s1 + p3[j] * s2
+            g0 = p0[j] + p1[j] * e0 + p2[j] * e1 + p3[j] * e2
+            g1 = g0 + share * slope
+            free = max(min(max(g0, g1) / (abs(slope) + tiny), share), zero)
+            radiance = emitted[j] if g0 < zero else rays[j]
+            sums[j] += w * free * radiance
+            rays[j] = emitted[j] if g1 < zero else radiance
+    else:
+        length, limit, extinction = real(length), real(manner.limit), cells.extinction[c, begun : begun + count]
+        source, a, u, v = here[2, :count], here[3, :count], here[4, :count], here[5, :count]
+        for j in range(count):
+            slope = p1[j] * s0 + p2[j] * s1 + p3[j] * s2
+            g0 = p0[j] + p1[j] * e0 + p2[j] * e1 + p3[j] * e2
+            g1 = g0 + share * slope
+            free = max(min(max(g0, g1) / (abs(slope) + tiny), share), zero)
+            start = share - free if g0 < zero else zero
+            radiance = emitted[j] if g0 < zero else rays[j]
+            tau = extinction[j] * length * free
+            time, rise = start + half * free, a[j] * s0 + u[j] * s1 + v[j] * s2
+            off = a[j] * e0 + u[j] * e1 + v[j] * e2 + rise * time
+            rise = rise * free
+            kept, excess, thick = exp(-tau), radiance - (source[j] + off), max(tau, limit)
+            thin = tau < limit
+            mean = mean_of(tau) if thin else (one - kept) / thick
+            bend = bend_of(tau) if thin else (half * (one + kept) - (one - kept) / thick) / thick
+            gone = radiance - tau * mean * excess if thin else source[j] + off + kept * excess
+            sums[j] += w * free * (source[j] + mean * excess - bend * rise)
+            rays[j] = emitted[j] if g1 < zero else gone + tau * bend * rise
+    for j in range(count):
+        after[margin + cell[j]] = rays[j]
+
+
+@compiled
+def through_free(planes, k, c, number, way, length, come, gone, light, manner, work, sums, weight):
+    """One segment as if all voxels were free."""
+    even, depth = planes.even[k, c] == EVEN, planes.depth[k, c]
+    path, w = way.share[number] * length, weight * way.share[number]
+    if not manner.medium or (even and depth == 0):
+        through_void(come, gone, sums, w)
+    elif manner.sloped:
+        middle_and_whole(way, number, work.point, work.whole)
+        slopes = light.slopes[0][k, c], light.slopes[1][k, c], light.slopes[2][k, c]
+        extinction = light.source[k, c] if even else planes.extinction[k, c]
+        through_sloped(
+            come, gone, light.source[k, c], slopes, sums, work.point, work.whole, even, depth, extinction, path, manner.limit, w
+        )
+    elif even:
+        through_even(come, gone, light.source[k, c], sums, depth * path, manner.limit, w)
+    elif planes.even[k, c] == PATCHY:
+        through_patchy(come, gone, light.source[k, c], sums, planes.extinction[k, c], depth, path, manner.limit, w)
+    elif manner.thin:
+        through_thin(come, gone, light.source[k, c], sums, planes.extinction[k, c], path, w)
+    else:
+        through_mixed(come, gone, light.source[k, c], sums, planes.extinction[k, c], path, manner.limit, w)
+
+
+@compiled
+def take_cut(cells, k, c, light, sums, manner, here):
+    """What is sent in the CUT voxels of a plane, and their sums so far."""
+    begun = cells.first[k]
+    for j in range(cells.first[k + 1] - begun):
+        cell = cells.cell[begun + j]
+        here[1, j], here[6, j] = 0.0, sums[cell]
+        if manner.medium:
+            here[2, j] = light.source[k, c, cell]
+        if manner.sloped:
+            here[3, j], here[4, j], here[5, j] = (
+                light.slopes[0][k, c, cell], light.slopes[1][k, c, cell], light.slopes[2][k, c, cell],
+            )  # fmt: skip
+
+
+@compiled
+def put_cut(cells, k, sums, here):
+    begun = cells.first[k]
+    for j in range(cells.first[k + 1] - begun):
+        sums[cells.cell[begun + j]] = here[6, j] + here[1, j]
+
+
+@compiled
+def from_ghosts(ghosts, k, c, n, ways, after, margin, light):
+    begun, end = ghosts.first[k], ghosts.first[k + 1]
+    if light.radiance.shape[0] == 0:
+        for j in range(begun, end):
+            after[margin + ghosts.cell[j]] = light.ghost[c, j]
+        return
+    for j in range(begun, end):
+        emitted = light.ghost[c, j]
+        if ghosts.image[j] >= 0:
+            emitted += light.radiance[ghosts.image[j], ways.index[n], c] * light.factor[c, j]
+        after[margin + ghosts.cell[j]] = emitted

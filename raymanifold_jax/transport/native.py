@@ -1,0 +1,417 @@
+"""Sweeps on a CPU by loops of our own (`machine_code`) instead of XLA's: the same sums in a fraction of the time.
+
+What a scene's sweeps share, the listed voxels and readers of each axis, is worked out once and kept as long as its layout,
+directions and extinction are. Each core takes some of the directions through all planes and adds up for itself.
+
+This serves known numbers of one device that is a CPU, where numba is installed; all else is left to `characteristic`, which
+gives the same results to rounding.
+
+Public: `serves`, `sweep`, `unsweep`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.util
+import weakref
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .. import checks
+from ..layout import AXES, Layout, Ordinates, Reads
+from .characteristic import Inflow, thin_limit
+from .cores import count_cores, on_cores, on_cpu
+
+if TYPE_CHECKING:
+    from . import machine_code
+
+_RAYS = 1 << 18  # rays that a core takes on at a time: they stay in its cache
+T = TypeVar("T")
+
+
+@functools.cache
+def _installed() -> bool:
+    return importlib.util.find_spec("numba") is not None
+
+
+def serves(layout: Any, ordinates: tuple[Ordinates, ...], arguments: Any) -> bool:
+    """Whether a sweep of these can be done here."""
+    known = isinstance(layout, Layout) and not checks.is_traced((layout, ordinates, arguments))
+    return known and _installed() and on_cpu(ordinates)
+
+
+class _Axis(NamedTuple):
+    """What all sweeps along an axis share, but for the medium."""
+
+    ways: machine_code.Ways
+    parts: tuple[np.ndarray, ...]  # directions of each core
+    shape: tuple[int, int, int]
+    cut: machine_code.Cells
+    ghosts: machine_code.Cells
+    unlisted: np.ndarray  # [K, P] voxels that are neither cut nor ghosts
+    hits: machine_code.Readers
+    probes: machine_code.Readers
+    at_cut: tuple[np.ndarray, np.ndarray]  # of each element image in a CUT voxel: its number, and that of the voxel
+    at_ghost: tuple[np.ndarray, np.ndarray]
+
+    @property
+    def area(self) -> int:
+        return self.shape[1] * self.shape[2]
+
+
+class _Medium(NamedTuple):
+    """The extinction of an axis, and of listed voxels."""
+
+    there: bool
+    even: np.ndarray
+    depth: np.ndarray
+    extinction: np.ndarray
+    cut: np.ndarray
+    readers: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]  # even, depth, extinction of the hits' and the probes'
+
+
+_kept: dict[tuple, Any] = {}
+
+
+def _keep(anchors: tuple[Array, ...], name: Any, make: Callable[[], T]) -> T:
+    """What `make` gives, as long as all of the `anchors` live."""
+    key = name, *map(id, anchors)
+    if key not in _kept:
+        _kept[key] = make()
+        for anchor in anchors:
+            weakref.finalize(anchor, _kept.pop, key, None)
+    return _kept[key]
+
+
+def sweep(
+    manner: Any,
+    layout: Layout,
+    ordinates: tuple[Ordinates, ...],
+    extinction: Float[Array, "C X Y Z"] | None,
+    exitance: Float[Array, "C E"],
+    source: Float[Array, "C nx ny nz"] | None,
+    slopes: tuple[Float[Array, "C X Y Z"], ...] | None,
+    inflow: Inflow | None,
+) -> tuple[Float[Array, "C E"], Float[Array, "C nx ny nz"] | None]:
+    """As `derivative.swept`."""
+    from . import machine_code as code
+
+    real, bands = np.dtype(exitance.dtype), exitance.shape[0]
+    sent = np.asarray(exitance)
+    volume = None
+    if extinction is not None:
+        dark = jnp.zeros((bands, *layout.shape), real)
+        volume = np.asarray(layout.to_padded(dark if source is None else source))
+    sloped = volume is not None and slopes is not None
+    at_elements = np.zeros((bands, layout.elements))
+    in_voxels = np.zeros((bands, *layout.padded), real)
+
+    def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
+        planes, cut, *readers = arguments
+        light = _frozen(code.Light(
+            source=np.zeros((1, bands, 1), real) if volume is None else _planes(volume, axis),
+            slopes=tuple(_planes(np.asarray(slopes[a]), axis) if sloped else np.zeros((1, 1, 1), real) for a in AXES[axis]),
+            cut=_gathered(sent, layout, line.at_cut, len(line.cut.cell)),
+            ghost=_gathered(sent, layout, line.at_ghost, len(line.ghosts.cell)),
+            radiance=np.zeros((0, 1, bands), real) if inflow is None else np.asarray(inflow.radiance),
+            factor=_factor(layout, line, inflow, bands),
+        ))  # fmt: skip
+
+        def run(part: np.ndarray):
+            sums = [np.zeros((bands, len(r.cell))) for r in readers]
+            voxels, work = np.zeros((line.shape[0], bands, line.area), real), _work(code, line, min(how.rows, len(part)), real)
+            code.forwards(part, line.ways, planes, cut, line.ghosts, *readers, light, how, work, *sums, voxels)
+            return sums, voxels
+
+        for sums, voxels in on_cores(run, line.parts):
+            for of_kind, of_readers in zip(readers, sums, strict=True):
+                at_elements[:] += [np.bincount(of_kind.element, band, layout.elements) for band in of_readers]
+            if manner.fluence:
+                in_voxels[:] += _from_planes(voxels, axis, line.shape)
+
+    for line in _lines(manner, layout, ordinates, extinction, bands, sloped, real):
+        along(*line)
+    voxels = layout.from_padded(jnp.asarray(in_voxels)) if manner.fluence else None
+    return jnp.asarray(at_elements, real), voxels
+
+
+def unsweep(
+    manner: Any,
+    layout: Layout,
+    ordinates: tuple[Ordinates, ...],
+    extinction: Float[Array, "C X Y Z"] | None,
+    at_elements: Float[Array, "C E"],
+    in_voxels: Float[Array, "C nx ny nz"] | None,
+    sloped: bool,
+) -> tuple[Float[Array, "C E"], Float[Array, "C nx ny nz"] | None, tuple[Float[Array, "C X Y Z"], ...] | None]:
+    """As `derivative.unswept`: the transpose of `sweep`."""
+    from . import machine_code as code
+
+    real, bands = np.dtype(at_elements.dtype), at_elements.shape[0]
+    medium, asked = extinction is not None, np.asarray(at_elements, float)
+    sloped = sloped and medium
+    volume = None if in_voxels is None else np.asarray(layout.to_padded(in_voxels))
+    exitance = np.zeros((bands, layout.elements))
+    # Of the source, and of its slopes along x, y and z.
+    fields = [np.zeros((bands, *layout.padded), real) for _ in range(medium * (1 + 3 * sloped))]
+    manner = dataclasses.replace(manner, fluence=volume is not None)
+
+    def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
+        planes, cut, *readers = arguments
+        wanted = _frozen(np.zeros((1, bands, 1), real) if volume is None else _planes(volume, axis))
+        of_readers = _frozen(tuple(asked[:, r.element] for r in readers))
+
+        def run(part: np.ndarray):
+            field = lambda there: np.zeros((line.shape[0], bands, line.area) if there else (1, 1, 1), real)
+            listed = lambda cells: np.zeros((bands, len(cells.cell)), real)
+            slopes, nothing = (field(sloped), field(sloped), field(sloped)), np.zeros((0, 1, 1), real)
+            back = code.Light(field(medium), slopes, listed(line.cut), listed(line.ghosts), nothing, nothing[:, 0])
+            work = _work(code, line, min(how.rows, len(part)), real)
+            code.backwards(part, line.ways, planes, cut, line.ghosts, *readers, how, work, *of_readers, wanted, back)
+            return back
+
+        for back in on_cores(run, line.parts):
+            for values, at in ((back.cut, line.at_cut), (back.ghost, line.at_ghost)):
+                exitance[:] += _scattered(values, layout, at)
+            found = [back.source, *(back.slopes[AXES[axis].index(a)] for a in range(3))]
+            for field, of_planes in zip(fields, found, strict=False):
+                field += _from_planes(of_planes, axis, line.shape)
+
+    for line in _lines(manner, layout, ordinates, extinction, bands, sloped, real):
+        along(*line)
+    source = layout.from_padded(jnp.asarray(fields[0])) if medium else None
+    return jnp.asarray(exitance, real), source, tuple(map(jnp.asarray, fields[1:])) if sloped else None
+
+
+def _lines(manner: Any, layout: Layout, ordinates, extinction, bands: int, sloped: bool, real: np.dtype) -> Iterator[tuple]:
+    """Each axis: its number, what is listed along it, and the arguments of `machine_code`."""
+    from . import machine_code as code
+
+    for axis, own in enumerate(ordinates):
+        if own.weight.shape[0]:
+            line = _axis(layout, own, axis)
+            medium = _medium(layout, line, axis, extinction, bands, real)
+            arguments = _arguments(code, layout, line, medium, axis)
+            yield axis, line, _frozen(arguments), _manner(code, manner, medium, sloped, line, real)
+
+
+def _manner(code, manner: Any, medium: _Medium, sloped: bool, line: _Axis, real) -> machine_code.Manner:
+    rows = max(2, _RAYS // max(line.area, 1))
+    thin = bool(manner.thin and not sloped)
+    return code.Manner(medium.there, sloped, thin, bool(manner.onward), bool(manner.fluence), thin_limit(real), min(rows, 32))
+
+
+def _work(code, line: _Axis, directions: int, real) -> machine_code.Work:
+    size, width = line.area, line.shape[2]
+    way = code.Segments(
+        np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3, int), np.zeros(3), np.zeros(4, int)
+    )  # fmt: skip
+    return code.Work(
+        rows=np.zeros((directions + 4, size + 2 * width), real), nowhere=np.zeros(size, real), asked=np.zeros((3, size), real),
+        here=np.zeros((12, int(np.diff(line.cut.first).max())), real), own=np.zeros(directions, int), free=np.zeros(4, int),
+        point=np.zeros(3), whole=np.zeros(3), form=np.zeros(8), way=way,
+    )  # fmt: skip
+
+
+def _arguments(code, layout: Layout, line: _Axis, medium: _Medium, axis: int) -> tuple:
+    _, height, width = line.shape
+    wrap_v = layout.pad[AXES[axis][2]] == 0
+    planes = code.Planes(height, width, wrap_v, float(layout.spacing), medium.even, medium.depth, medium.extinction)
+    readers = (
+        r._replace(even=even, depth=depth, extinction=each)
+        for r, (even, depth, each) in zip((line.hits, line.probes), medium.readers, strict=True)
+    )
+    return planes, line.cut._replace(extinction=medium.cut), *readers
+
+
+def _frozen(given: T) -> T:
+    """Arrays as views that cannot be written to: numba compiles anew for every mixture of arrays that can and cannot."""
+    if isinstance(given, tuple):
+        parts = [_frozen(part) for part in given]
+        return type(given)(*parts) if hasattr(given, "_fields") else tuple(parts)  # pyright: ignore
+    if isinstance(given, np.ndarray):
+        given = np.ascontiguousarray(given).view()
+        given.flags.writeable = False
+    return given
+
+
+def _planes(field: np.ndarray, axis: int) -> np.ndarray:
+    """A padded field [C, X, Y, Z] as planes [K, C, P]."""
+    a, u, v = AXES[axis]
+    turned = field.transpose(1 + a, 0, 1 + u, 1 + v)
+    return np.ascontiguousarray(turned).reshape(*turned.shape[:2], -1)
+
+
+def _from_planes(planes: np.ndarray, axis: int, shape: tuple[int, int, int]) -> np.ndarray:
+    field = planes.reshape(shape[0], -1, shape[1], shape[2])
+    dims = (0, 2, 3)
+    return field.transpose(1, *(dims[AXES[axis].index(a)] for a in range(3)))
+
+
+def _gathered(values: np.ndarray, layout: Layout, at: tuple[np.ndarray, np.ndarray], count: int) -> np.ndarray:
+    """In each listed voxel the sum over the element images there: their values times their share."""
+    image, place = at
+    share, element = np.asarray(layout.share)[image], np.asarray(layout.source_element)[image]
+    total = [np.bincount(place, band[element] * share, count) for band in values]
+    return np.array(total, values.dtype).reshape(len(values), count)
+
+
+def _scattered(values: np.ndarray, layout: Layout, at: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+    """The transpose of `_gathered`."""
+    image, place = at
+    share, element = np.asarray(layout.share)[image], np.asarray(layout.source_element)[image]
+    return np.array([np.bincount(element, band[place] * share, layout.elements) for band in values])
+
+
+def _factor(layout: Layout, line: _Axis, inflow: Inflow | None, bands: int) -> np.ndarray:
+    if inflow is None or inflow.factor is None:
+        return np.ones((bands, len(line.ghosts.cell)), layout.plane.dtype)
+    return _gathered(np.asarray(inflow.factor), layout, line.at_ghost, len(line.ghosts.cell))
+
+
+def _axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
+    assert own.hit_bits is not None and own.probe_bits is not None  # by mark_hits
+    return _keep((layout.plane, own.weight, own.hit_bits), ("axis", axis), lambda: _make_axis(layout, own, axis))
+
+
+def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
+    from . import machine_code as code
+
+    order = AXES[axis]
+    count, height, width = shape = layout.padded_along(axis)
+    turned = lambda field: np.asarray(field).transpose(order).reshape(count, -1)
+    ghost = np.ones(layout.padded, bool)
+    ghost[tuple(slice(p, n - p) for p, n in zip(layout.pad, layout.padded, strict=True))] = False
+    ghost = turned(ghost)
+    plane = [turned(layout.plane[row]) for row in (0, *(1 + a for a in order))]
+    surface = (plane[0] != 1.0) & ~ghost
+    real = np.dtype(layout.plane.dtype)
+    cut = _cells(code, surface, plane, None, real)
+    ghosts = _cells(code, ghost, None, turned(layout.inflow_image), real)
+    number = np.full(count * height * width, -1)
+    for cells in (cut, ghosts):
+        number[_flat(cells, height * width)] = np.arange(len(cells.cell))
+    # Where each element image is: on planes of this axis.
+    voxel = np.unravel_index(np.asarray(layout.cell), layout.padded)
+    home = (voxel[order[0]] * height + voxel[order[1]]) * width + voxel[order[2]]
+    in_ghost = ghost.ravel()[home]
+    at = lambda image: (image, number[home[image]])
+    chunk, place = np.nonzero(np.asarray(own.weight) != 0)
+    ways = _ways(code, own, chunk, place)
+    hits, probes = (
+        _readers(code, reads, _marks(bits, chunk, place, wanted), number, surface, height * width)
+        for reads, bits, wanted in zip(layout.reads[axis], (own.hit_bits, own.probe_bits), (1, 0), strict=True)
+    )
+    # A core takes directions from all over, sorted by sense: the two senses meet planes in opposite order.
+    numbers = np.argsort(-ways.sense, kind="stable")
+    parts = tuple(part for first in range(count_cores()) if len(part := numbers[first :: count_cores()]))
+    line = _frozen((ways, parts, shape, cut, ghosts, ~surface & ~ghost, hits, probes))
+    return _Axis(*line, at(np.nonzero(~in_ghost)[0]), at(np.nonzero(in_ghost)[0]))
+
+
+def _flat(cells: machine_code.Cells, area: int) -> np.ndarray:
+    return np.repeat(np.arange(len(cells.first) - 1), np.diff(cells.first)) * area + cells.cell
+
+
+def _cells(code, chosen: np.ndarray, plane, image: np.ndarray | None, real: np.dtype) -> machine_code.Cells:
+    number, cell = np.nonzero(chosen)
+    first = np.concatenate([[0], np.cumsum(np.bincount(number, minlength=len(chosen)))])
+    none = np.zeros((4, 0), real)
+    return code.Cells(
+        first=first,
+        cell=cell,
+        plane=none if plane is None else np.array([values[number, cell] for values in plane], real),
+        extinction=none,
+        image=np.zeros(0, int) if image is None else image[number, cell].astype(int),
+    )
+
+
+def _readers(code, reads: Reads, marks: np.ndarray, number: np.ndarray, surface: np.ndarray, area: int) -> machine_code.Readers:
+    """Reads in runs of the same plane and surface; `marks` [N, M] tells who reads in which direction."""
+    plane = np.repeat(np.arange(len(reads.first_tile) - 1), np.diff(np.asarray(reads.first_tile)) * reads.tile)
+    used = np.nonzero(sum(np.abs(np.asarray(n))[: len(plane)] for n in reads.plane[1:]) > 0)[0]  # the rest only pads
+    plane, cell = plane[used], np.asarray(reads.cell)[used].astype(int)
+    where = plane * area + cell
+    cut = np.where(surface.ravel()[where], number[where], -1)
+    face = np.array([np.asarray(values)[used] for values in (*reads.plane, reads.height)], float)
+    keys = np.array([*face, cut, plane])
+    order = np.lexsort(keys)
+    keys = keys[:, order]
+    begins = np.nonzero(np.concatenate([[len(order) > 0], np.any(keys[:, 1:] != keys[:, :-1], axis=0)]))[0]
+    count = len(reads.first_tile) - 1
+    return code.Readers(
+        runs=np.searchsorted(plane[order][begins], np.arange(count + 1)),
+        first=np.append(begins, len(order)),
+        face=np.ascontiguousarray(face[:4, order][:, begins]),
+        height=face[4, order][begins],
+        cut=cut[order][begins],
+        cell=cell[order].astype(np.int32),
+        element=np.asarray(reads.element)[used][order].astype(int),
+        bits=np.packbits(marks[:, used][:, order], axis=1, bitorder="little"),
+        even=np.zeros((1, 0), bool),
+        depth=np.zeros((1, 0)),
+        extinction=np.zeros((1, 0)),
+    )
+
+
+def _marks(bits: Array, chunk: np.ndarray, place: np.ndarray, wanted: int) -> np.ndarray:
+    """Whether each direction's bit is the one that is wanted, of each read: [N, M]."""
+    words = np.asarray(bits)[chunk, place >> 5]
+    return (words >> (place & 31).astype(np.uint32)[:, None] & 1) == wanted
+
+
+def _ways(code, own: Ordinates, chunk: np.ndarray, place: np.ndarray) -> machine_code.Ways:
+    """The directions in use, out of their chunks."""
+    pick = lambda values, kind=float: np.asarray(values)[chunk, place].astype(kind)
+    of_chunk = lambda values: np.asarray(values)[chunk].astype(int)
+    return code.Ways(
+        weight=pick(own.weight),
+        toward=pick(own.direction),
+        slope=pick(own.slope),
+        start=pick(own.start),
+        sense=of_chunk(own.sign),
+        laps=of_chunk(own.laps),
+        index=pick(own.index, int),
+    )
+
+
+def _medium(layout: Layout, line: _Axis, axis: int, extinction, bands: int, real: np.dtype) -> _Medium:
+    from . import machine_code as code
+
+    if extinction is None:
+        count = line.shape[0]
+        nothing = np.zeros((bands, 0), real)
+        reader = np.zeros((bands, 0), bool), np.zeros((bands, 0)), np.zeros((bands, 0))
+        free = np.full((count, bands), code.EVEN), np.zeros((count, bands))
+        return _Medium(False, *free, np.zeros((1, 1, 1), real), nothing, (reader, reader))
+    name = "medium", axis, id(line.hits.bits)
+    return _keep((layout.plane, extinction), name, lambda: _make_medium(line, axis, extinction, real))
+
+
+def _make_medium(line: _Axis, axis: int, extinction: Float[Array, "C X Y Z"], real: np.dtype) -> _Medium:
+    from . import machine_code as code
+
+    planes = _planes(np.asarray(extinction), axis)
+    unlisted = line.unlisted[:, None]
+    most = np.where(unlisted, planes, 0.0).max(-1)
+    least = np.where(unlisted, planes, np.inf).min(-1)
+    between = (unlisted & (planes > 0) & (planes < most[..., None])).any(-1)
+    even = np.where(between, code.UNEVEN, np.where(least < most, code.PATCHY, code.EVEN))
+    depth = np.where(between, 0.0, most).astype(float)
+    number = lambda first: np.repeat(np.arange(len(first) - 1), np.diff(first))
+
+    def of_readers(r: machine_code.Readers):
+        each = planes[number(r.runs)[number(r.first)], :, r.cell].T.astype(float)
+        least, most = (f.reduceat(each, r.first[:-1], axis=1) if len(r.cell) else each for f in (np.minimum, np.maximum))
+        return least == most, most, np.ascontiguousarray(each)
+
+    cut = planes[number(line.cut.first), :, line.cut.cell].T
+    return _Medium(
+        True, even, depth, np.zeros((1, 1, 1), real) if np.all(even == code.EVEN) else planes, np.ascontiguousarray(cut),
+        (of_readers(line.hits), of_readers(line.probes)),
+    )  # fmt: skip

@@ -1,0 +1,133 @@
+"""Sweeps by loops of our own give what XLA's do, forwards and backwards, in float64 to rounding.
+
+Numbers in solids are left out: nobody reads them, and rays there are not the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import raymanifold_jax as rm
+from raymanifold_jax.operator import Transport, _slopes, make_transport, materials
+from raymanifold_jax.prepare import prepare
+from raymanifold_jax.transport import derivative, native
+from raymanifold_jax.transport.characteristic import Inflow
+
+pytest.importorskip("numba", reason="the extra `fast`")
+
+
+@pytest.fixture(autouse=True)
+def double() -> Iterator[None]:
+    with jax.enable_x64(True):
+        yield
+
+
+def _uneven(shape: tuple[int, ...], strength: float) -> np.ndarray:
+    return strength * np.random.default_rng(5).uniform(0, 2, shape) ** 2
+
+
+def _box(medium: rm.Medium | None, boundary: rm.Boundary, shape: tuple[int, int, int] = (9, 9, 9)) -> rm.Scene:
+    ball = rm.Solid(rm.Sphere((0.5, 0.5, 0.45), 0.23).union(rm.Box((0.1, 0.1, 0), (0.3, 0.35, 0.3))), 0.8)
+    return rm.Scene(rm.Lattice(shape, 1 / 9), solids=[ball], medium=medium, lights=[rm.Sky(1.0)], boundary=boundary)
+
+
+_ROOM = rm.Boundary(x=rm.Wall(0.5), y=rm.OPEN, z=(rm.Wall(0.7), rm.OPEN))
+_AROUND = rm.Boundary(x=rm.PERIODIC, y=rm.MIRROR, z=(rm.Wall(0.7), rm.OPEN))
+_TORUS = rm.Boundary(x=rm.OPEN, y=rm.PERIODIC, z=rm.PERIODIC)
+_SCENES = {
+    "vacuum": lambda: _box(None, _ROOM),
+    "thin fog": lambda: _box(rm.Medium(scattering=0.5, absorption=0.1), _ROOM),
+    "thick fog": lambda: _box(rm.Medium(scattering=8.0, absorption=0.5), _ROOM),
+    "thin uneven fog": lambda: _box(rm.Medium(scattering=_uneven((9, 9, 9), 0.2), absorption=0.0), _ROOM),
+    "thick uneven fog in two bands": lambda: _box(rm.Medium(_uneven((9, 9, 9, 2), 12.0), absorption=0.3), _ROOM),
+    "around an axis, mirrored": lambda: _box(rm.Medium(_uneven((5, 6, 9), 4.0), absorption=0.3), _AROUND, (5, 6, 9)),
+    "around two axes": lambda: _box(rm.Medium(2.0, absorption=0.5), _TORUS, (9, 5, 4)),
+    "one column": lambda: rm.Scene(
+        rm.Lattice((1, 1, 6), 0.5), medium=rm.Medium(1.0, 0.2), lights=[rm.Sky(1.0)],
+        boundary=rm.Boundary(x=rm.PERIODIC, y=rm.PERIODIC, z=(rm.Wall(0.3), rm.OPEN)),
+    ),
+}  # fmt: skip
+
+
+class _Case:
+    """A scene's sweep with random light, and the free voxels."""
+
+    def __init__(self, scene: rm.Scene):
+        prepared = prepare(scene)
+        stuff = materials(scene, prepared.surfaces)
+        quadrature = rm.quadrature.for_scene(scene, 40)
+        self.bands, self.layout = scene.bands, prepared.layout
+        self.transport: Transport = make_transport(
+            self.layout, quadrature, stuff.extinction, self.bands, albedo=stuff.scattering_albedo
+        )
+        self.free = ~prepared.surfaces.solid
+        self._random = np.random.default_rng(3)
+        self.elements = self.random(self.layout.elements)
+        self.voxels = None if stuff.extinction is None else self.random(*self.layout.shape) * self.free
+        images = len(self.layout.unfolding.images())
+        radiance = jnp.asarray(self._random.uniform(size=(images, len(quadrature), self.bands)))
+        self.inflow = Inflow(radiance, self.random(self.layout.elements))
+        self.slopes = None
+        if self.voxels is not None and self.transport.albedo is not None:
+            self.slopes = _slopes(self.layout, self.voxels, self.transport.albedo, self.transport.extinction)
+        self.manner = derivative.Manner(self.transport.thin, self.transport.onward)
+        self.known = self.layout, self.transport.ordinates, self.transport.extinction
+
+    def random(self, *shape: int) -> jax.Array:
+        return jnp.asarray(self._random.uniform(size=(self.bands, *shape)))
+
+
+def _close(found, expected, free: np.ndarray) -> None:
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
+        if a.shape[1:] == free.shape:
+            a, b = a * free, b * free
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * float(jnp.abs(b).max()))
+
+
+_QUICK = {"vacuum", "thin fog", "thick uneven fog in two bands", "around an axis, mirrored"}
+_EACH = pytest.mark.parametrize("name", [n if n in _QUICK else pytest.param(n, marks=pytest.mark.slow) for n in _SCENES])
+
+
+@_EACH
+def test_sweep(name):
+    case = _Case(_SCENES[name]())
+    for slopes, inflow in {(id(s), id(i)): (s, i) for s in (None, case.slopes) for i in (None, case.inflow)}.values():
+        given = *case.known, case.elements, case.voxels, slopes, inflow
+        assert native.serves(*given[:2], given[2:])
+        expected = derivative._sweep_program(case.manner, *given)
+        _close(native.sweep(case.manner, *given), expected, case.free)
+
+
+@_EACH
+def test_transpose(name):
+    case = _Case(_SCENES[name]())
+    for sloped in {False, case.slopes is not None}:
+        expected = derivative._unsweep_program(case.manner, sloped, *case.known, case.elements, case.voxels)
+        found = native.unsweep(case.manner, *case.known, case.elements, case.voxels, sloped)
+        _close(found[:2], expected[:2], case.free)
+        if sloped:
+            _, back = jax.vjp(
+                lambda s: _slopes(case.layout, s, case.transport.albedo, case.transport.extinction), jnp.zeros_like(case.voxels)
+            )
+            _close(back(found[2]), back(expected[2]), case.free)
+
+
+def test_without_fluence():
+    case = _Case(_SCENES["thick uneven fog in two bands"]())
+    given = *case.known, case.elements, case.voxels, None, case.inflow
+    manner = derivative.Manner(case.transport.thin, case.transport.onward, fluence=False)
+    elements, voxels = native.sweep(manner, *given)
+    assert voxels is None
+    _close(elements, derivative._sweep_program(manner, *given)[0], case.free)
+
+
+def test_single_precision_is_single():
+    with jax.enable_x64(False):
+        solution = rm.solve(_SCENES["thin fog"](), rtol=1e-3, progress=False)
+        assert solution.fluence.dtype == np.float32
+        assert solution.converged
