@@ -130,7 +130,7 @@ class Sky(eqx.Module):
           azimuth 0 (+x), azimuth increasing towards +y. Pixel (i, j) is centred at polar angle pi (i + 1/2) / h and
           azimuth pi (j + 1/2) / h; between centres it is interpolated, across the seam and the poles too;
         - a function of the directions *towards* the sky, (n, 3) -> (n,) or (n, bands), written in `jax.numpy`. A plain
-          function is static; an `equinox.Module` that can be called keeps its leaves.
+          function is static; an `equinox.Module` that can be called keeps its leaves. `rm.skies` has the CIE standard skies.
     - `hemisphere`: if given, only the half of the sky around this direction (3,) shines.
     """
 

@@ -24,6 +24,7 @@ from ..lattice import Lattice
 from ..mesh import Mesh
 from ..scene import MIRROR, OPEN, PERIODIC, Boundary, Medium, PointLight, Scene, Sky, Solid, Sun, Wall
 from ..shapes import Box, Cylinder, HalfSpace, Shape, Sphere, Torus
+from ..skies import KINDS, SUNLESS, cie
 from ..spectra import Bands
 from ..voxels import Voxels
 from .exr import read_exr
@@ -235,29 +236,13 @@ def _medium(table: Table, lattice: Lattice) -> Medium:
 def _light(table: Table) -> Sky | Sun | PointLight:
     kind = table.take("kind", read=Table.text)
     if kind == "sky":
-        hemisphere = table.take("hemisphere", None, Table.vector)
-        radiance = table.take("radiance", 1.0, Table.numbers)
-        image = table.take("image", None, Table.text)
-        table.done()
-        with table.checked():
-            if image is not None:
-                factor = np.atleast_1d(np.asarray(radiance, float))
-                path = table.source.folder / image
-                if path.suffix.lower() == ".npy":
-                    radiance = np.load(path, allow_pickle=False) * (factor if factor.size > 1 else factor[0])
-                else:
-                    radiance = read_sky(path) * factor
-            return Sky(radiance, hemisphere)
+        return _sky(table)
     if kind == "sun":
-        travel = table.take("direction", None, Table.vector)
-        height, azimuth = table.take("elevation", None, Table.angle), table.take("azimuth", None, Table.angle)
+        travel = _travel(table)
         irradiance = table.take("irradiance", 1.0, Table.numbers)
         table.done()
-        if (travel is None) == (height is None or azimuth is None):
-            got = "both or neither of direction and elevation, azimuth"
-            raise table.fail(None, got, "one of them", "direction is that of travel; azimuth is counted from +x towards +y")
-        if travel is None and height is not None and azimuth is not None:
-            travel = [-math.cos(height) * math.cos(azimuth), -math.cos(height) * math.sin(azimuth), -math.sin(height)]
+        if travel is None:
+            raise table.fail(None, "neither of direction and elevation, azimuth", "one of them", _TRAVEL)
         with table.checked():
             return Sun(travel, irradiance)
     if kind == "point":
@@ -266,6 +251,57 @@ def _light(table: Table) -> Sky | Sun | PointLight:
         with table.checked():
             return PointLight(position, intensity)
     raise table.fail("kind", kind, "one of sky, sun, point", 'write kind = "sky"')
+
+
+_TRAVEL = "direction is that of travel; azimuth is counted from +x towards +y"
+
+
+def _travel(table: Table) -> list[float] | None:
+    """The direction in which sunlight travels, if the table tells where the sun is."""
+    travel = table.take("direction", None, Table.vector)
+    height, azimuth = table.take("elevation", None, Table.angle), table.take("azimuth", None, Table.angle)
+    if travel is not None and not (height is None and azimuth is None):
+        raise table.fail(None, "both of direction and elevation, azimuth", "one of them", _TRAVEL)
+    if (height is None) != (azimuth is None):
+        raise table.fail(None, "one of elevation and azimuth", "both", _TRAVEL)
+    if height is None or azimuth is None:
+        return travel
+    return [-math.cos(height) * math.cos(azimuth), -math.cos(height) * math.sin(azimuth), -math.sin(height)]
+
+
+def _sky(table: Table) -> Sky:
+    hemisphere = table.take("hemisphere", None, Table.vector)
+    image, kind = table.take("image", None, Table.text), table.take("cie", None, Table.whole)
+    if kind is not None:
+        if image is not None:
+            raise table.fail("cie", kind, "one of cie and image", "leave one out")
+        travel = _travel(table)
+        values = {key: table.take(key, None, Table.numbers) for key in ("radiance", "irradiance")}
+        up, ground = table.take("up", [0.0, 0.0, 1.0], Table.vector), table.take("ground", 0.0, Table.numbers)
+        table.done()
+        if None not in values.values():
+            raise table.fail(
+                "irradiance", values["irradiance"], "one of radiance (at the zenith) and irradiance", "leave one out"
+            )
+        if travel is None and kind in KINDS and kind not in SUNLESS:
+            raise table.fail(None, "no sun", "elevation and azimuth of the sun, or direction", _TRAVEL)
+        with table.checked(kind="cie", zenith="radiance", sun_direction="elevation" if table.has("elevation") else "direction"):
+            return Sky(cie(kind, travel, values["radiance"], values["irradiance"], up, ground), hemisphere)
+    radiance = table.take("radiance", 1.0, Table.numbers)
+    table.known += ["elevation", "azimuth", "direction", "irradiance", "up", "ground"]
+    for key in ("elevation", "azimuth", "direction", "irradiance", "up", "ground"):
+        if table.has(key):
+            raise table.fail(key, table.values[key], "nothing, without cie", "add a line cie = 12, or leave it out")
+    table.done()
+    with table.checked():
+        if image is not None:
+            factor = np.atleast_1d(np.asarray(radiance, float))
+            path = table.source.folder / image
+            if path.suffix.lower() == ".npy":
+                radiance = np.load(path, allow_pickle=False) * (factor if factor.size > 1 else factor[0])
+            else:
+                radiance = read_sky(path) * factor
+        return Sky(radiance, hemisphere)
 
 
 def read_sky(path: str | os.PathLike[str]) -> np.ndarray:

@@ -22,6 +22,7 @@ from ..lattice import Lattice
 from ..mesh import Mesh
 from ..scene import Medium, PointLight, Scene, Sky, Sun, Wall
 from ..shapes import Difference, Intersection, Rotated, Shape, Translated, Union
+from ..skies import CieSky
 from ..spectra import Bands
 from ..texture import Texture
 from ..voxels import Voxels
@@ -85,6 +86,10 @@ absorption = "0.05 /m"
 kind = "sky"
 radiance = [0.35, 0.5, 0.8]      # W m^-2 sr^-1
 # image = "sky.exr"              # latitude-longitude, twice as wide as high; times radiance
+# cie = 12                       # or a CIE standard sky: 1 overcast, 5 even, 12 clear; then radiance is that at the zenith,
+# elevation = 55                 # and the sun's place sets the pattern (1, 3, 5 and 16 need none; the sun's own light is below)
+# azimuth = 200
+# ground = 0.1                   # radiance from below the horizon
 
 [[lights]]
 kind = "sun"
@@ -125,8 +130,8 @@ def save_scene(
 
     `bands`: the wavelengths of the scene's bands; with them `white`, the band values that pictures show as white, D65 if None.
 
-    **Raises** `ValueError` for what a file cannot hold (skies that are functions, shapes of one's own); `FileNotFoundError`
-    if the directory is missing.
+    **Raises** `ValueError` for what a file cannot hold (skies and shapes of one's own); `FileNotFoundError` if the directory is
+    missing.
     """
     checks.instance("scene", scene, Scene, "pass an rm.Scene")
     path = Path(path)
@@ -224,10 +229,15 @@ class _Writer:
             return {"kind": "sun", "direction": _plain(light.direction), "irradiance": _plain(light.irradiance)}
         if isinstance(light, PointLight):
             return {"kind": "point", "position": _plain(light.position), "intensity": _plain(light.intensity)}
+        half = {} if light.hemisphere is None else {"hemisphere": _plain(light.hemisphere)}
+        if isinstance(light.radiance, CieSky):
+            sky = light.radiance
+            sun = {} if sky.sun_direction is None else {"direction": _plain(sky.sun_direction)}
+            rows = {"kind": "sky", "cie": sky.kind, **sun, "radiance": _plain(sky.zenith)}
+            return rows | {"ground": _plain(sky.ground), "up": _plain(sky.up), **half}
         if callable(light.radiance):
             advice = "sample it as a latitude-longitude image first"
             checks.fail(f"lights[{number}].radiance", "a function", "numbers or an image", advice)
-        half = {} if light.hemisphere is None else {"hemisphere": _plain(light.hemisphere)}
         radiance = np.asarray(light.radiance)
         if radiance.ndim < 2:
             return {"kind": "sky", "radiance": _plain(radiance), **half}
