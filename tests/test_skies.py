@@ -24,7 +24,7 @@ def towards(zenith_angle, azimuth):
     return np.stack([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)], -1).reshape(-1, 3)
 
 
-def seen(sky, zenith_angle, azimuth=0.0):
+def seen(sky, zenith_angle: Any, azimuth: Any = 0.0):
     return np.asarray(sky(jnp.asarray(towards(zenith_angle, azimuth), float)))
 
 
