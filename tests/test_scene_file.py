@@ -6,6 +6,7 @@ Everything here is exact, or to rounding in single precision (relative 1e-7).
 import contextlib
 import re
 import tomllib
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -60,6 +61,23 @@ def test_the_example(tmp_path):
     mesh = text.index('[[solids]]\nshape = "mesh"')
     text = text[:mesh] + text[text.index("[medium]") :]
     assert len(load(tmp_path, text).cameras) == 2
+
+
+def test_the_scene_in_the_readme(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    (text,) = re.findall(r"```toml\n(.*?)```", (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    trimesh.creation.icosphere(2).export(tmp_path / "model.ply")
+    file: Any = load(tmp_path, text.replace("resolution = 256", "resolution = 16"))
+    scene = file.scene
+    assert scene.summary().startswith("80 x 80 x 40 voxels of 0.025, 1 solid, medium, light: Sun + Sky, 3 bands")
+    lower, upper = scene.solids[0].shape.bounds()
+    np.testing.assert_allclose((lower, upper), ((0.6, 0.6, 0), (1.4, 1.4, 0.8)), atol=1e-6)
+    # The eye is outside of the box, and looks at the model.
+    eye, way = file.cameras["camera1"](scene.lattice, (9, 9)).rays(1, (4, 5))
+    eye, way = np.asarray(eye)[0, 4, 0], np.asarray(way)[0, 4, 0]
+    assert not scene.lattice.contains(eye).any()
+    along = eye + np.linspace(0, 4, 200)[:, None] * way
+    assert scene.distance(along).min() < 0
 
 
 def test_units(tmp_path):

@@ -72,9 +72,10 @@ albedo = 0.8
 # [[solids]]
 # shape = "mesh"                 # needs trimesh: pip install 'raymanifold-jax[mesh]'
 # file = "model.ply"             # OBJ, PLY, STL, GLB, ... beside this file
-# up = "y"                       # of the file
-# fit_lower = [0.2, 0.2, 0.0]    # scale it into this box; or scale = 0.01
+# up = "y"                       # the file's axis that points up, "y" or "z": if it lies on its side, the other
+# fit_lower = [0.2, 0.2, 0.0]    # scale it to fit between these corners, standing on the lower one; or scale = 0.01
 # fit_upper = [1.0, 1.0, 0.8]
+# resolution = 256               # finer edges and thin parts (128 along its longest side, if left out)
 # albedo = 0.6
 
 [medium]                         # leave it out for vacuum
