@@ -350,6 +350,12 @@ class Scene(eqx.Module):
         )
         return ", ".join(parts) + "; sides " + ", ".join(axes)
 
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        from .display import scene_html
+
+        return scene_html(self)
+
 
 SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")
 

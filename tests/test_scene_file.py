@@ -339,6 +339,90 @@ def test_a_sky_image_is_seen_the_right_way_round(tmp_path):
     np.testing.assert_allclose(scene.lights[0].radiance_along(-towards * [1, -1, 1]), 0, atol=1e-6)
 
 
+# Values that vary over surfaces
+
+
+def coloured_box(folder):
+    """A box of six coloured sides, as other programs write it: each face an sRGB colour of its own."""
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.creation.box((1, 1, 1))
+    colors = np.random.default_rng(1).integers(0, 256, (12, 4))
+    box.visual = trimesh.visual.ColorVisuals(box, face_colors=np.where([True, True, True, False], colors, 255).astype(np.uint8))
+    box.export(folder / "box.ply")
+    return box
+
+
+MESH = (
+    SMALL
+    + """\
+[[solids]]
+shape = "mesh"
+file = "box.ply"
+resolution = 32
+fit_lower = [0.2, 0.2, 0.2]
+fit_upper = [0.8, 0.8, 0.8]
+"""
+)
+
+
+def test_a_mesh_with_the_colours_of_its_file(tmp_path):
+    box = coloured_box(tmp_path)
+    scene: Any = load(tmp_path, MESH + 'albedo = { faces = "colors" }\n').scene
+    assert scene.bands == 3
+    texture = scene.solids[0].albedo
+    middle = 0.5 + 0.6 * np.asarray(box.triangles_center)
+    found = np.asarray(texture.values)[texture.cell(scene.lattice, middle)]
+    np.testing.assert_allclose(rm.io.to_srgb8(found[None])[0], box.visual.face_colors[:, :3], atol=1)
+
+
+def test_textures_come_back(tmp_path):
+    coloured_box(tmp_path)
+    rng = np.random.default_rng(0)
+    np.save(tmp_path / "sides.npy", rng.random((12, 2)))
+    np.save(tmp_path / "floor.npy", rng.random((3, 4, 2)))
+    text = MESH + 'albedo = { faces = "sides.npy" }\n[boundary]\n'
+    text += 'z = [{ albedo = { texture = "floor.npy", lower = ["10 cm", 0], upper = [0.9, 1] } }, "open"]\n'
+    scene: Any = load(tmp_path, text + 'x = { albedo = { texture = "floor.npy", axis = "x" } }\n').scene
+    rm.io.save_scene(tmp_path / "again.toml", scene)
+    again: Any = rm.io.load_scene(tmp_path / "again.toml").scene
+    x = rng.random((200, 3)) * 0.6 + 0.2
+    x[np.arange(200), rng.integers(0, 3, 200)] = rng.choice([0.2, 0.8], 200)
+    for before, after in (
+        (scene.solids[0].albedo, again.solids[0].albedo),
+        (scene.boundary.sides[4].albedo, again.boundary.sides[4].albedo),
+        (scene.boundary.sides[1].albedo, again.boundary.sides[1].albedo),
+    ):
+        values = [np.asarray(t.values)[t.cell(scene.lattice, x)] for t in (before, after)]
+        np.testing.assert_allclose(*values, rtol=1e-7)
+        assert np.ptp(values[0]) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("rows", "line", "message"),
+    [
+        ('albedo = { faces = "no.npy" }\n', 11, r"solids\[0\]\.albedo\.faces: got no\.npy, expected a file that exists"),
+        ('albedo = { faces = "junk.npy" }\n', 11, r"faces: got junk\.npy, expected an array of numbers"),
+        ('albedo = { faces = "box.ply" }\n', 11, r"faces: got box\.ply, expected a file \.npy"),
+        ('albedo = { faces = "short.npy" }\n', 11, r"values: got an array of shape \(5,\), expected \(12,\)"),
+        ('albedo = { faces = "dark.npy" }\n', 11, r"albedo\.values: got 1\.5 at index"),
+        ('albedo = { faces = "colors", fases = 1 }\n', 11, r"fases: got a name that means nothing here"),
+        ('albedo = { texture = "short.npy" }\n', 11, r"albedo: values: got an array of shape \(5,\)"),
+        ('albedo = { texture = "flat.npy", axis = "w" }\n', 11, r"axis: got 'w'"),
+        ('difference = [{ shape = "sphere", center = [0, 0, 0], radius = 1}]\nalbedo = { faces = "dark.npy" }\n', 12, "mesh:"),
+        ('[boundary]\nz = { albedo = { faces = "dark.npy" } }\n', 12, r"faces: got a wall, expected a mesh"),
+        ('albedo = { faces = "colors" }\n[bands]\nedges = [400, 500, 600]\n', 11, r"faces: got colors, expected values in the"),
+    ],
+)  # fmt: skip
+def test_textures_that_are_wrong(tmp_path, rows, line, message):
+    coloured_box(tmp_path)
+    np.save(tmp_path / "short.npy", np.full(5, 0.5))
+    np.save(tmp_path / "dark.npy", np.full(12, 1.5))
+    np.save(tmp_path / "flat.npy", np.full((2, 2), 0.5))
+    (tmp_path / "junk.npy").write_bytes(b"\x93NUMPY junk")
+    with pytest.raises(rm.io.SceneFileError, match=rf"scene\.toml:{line}: .*{message}"):
+        load(tmp_path, MESH + rows)
+
+
 # On the command line
 
 

@@ -26,8 +26,10 @@ from ..scene import MIRROR, OPEN, PERIODIC, Boundary, Medium, PointLight, Scene,
 from ..shapes import Box, Cylinder, HalfSpace, Shape, Sphere, Torus
 from ..skies import KINDS, SUNLESS, cie
 from ..spectra import Bands
+from ..texture import Texture
 from ..voxels import Voxels
 from .exr import read_exr
+from .mesh_colors import read_face_colors
 from .toml_table import LENGTHS, SceneFileError, Table, read_toml
 from .volume import medium_from_density, read_volume, resampled
 
@@ -136,11 +138,46 @@ def _lattice(table: Table, size: int | None) -> tuple[Lattice, Lattice]:
 
 def _solid(table: Table, lattice: Lattice) -> Solid:
     shape = _shape(table, lattice)
-    albedo = table.take("albedo", 0.5, Table.numbers)
+    albedo = table.take("albedo", 0.5, _albedo_of(shape))
     emission = table.take("emission", 0.0, Table.numbers)
     table.done()
     with table.checked():
         return Solid(shape, albedo, emission)
+
+
+def _albedo_of(shape: Shape | None) -> Callable:
+    """Reads numbers, a texture, or (of a mesh) a value for each face."""
+
+    def read(table: Table, key: str, value: Any) -> Any:
+        if not (isinstance(value, dict) and ("texture" in value or "faces" in value)):
+            return Table.numbers(table, key, value)
+        inner = Table(value, (*table.path, key), table.source)
+        if inner.has("texture"):
+            values = _numbers(inner, "texture")
+            axis = inner.take("axis", "z", Table.text)
+            lower, upper = (inner.take(name, None, Table.places) for name in ("lower", "upper"))
+            inner.done()
+            with inner.checked():
+                return Texture(values, axis, lower, upper)
+        if shape is None:
+            raise inner.fail("faces", "a wall", "a mesh", "walls take { texture = ... }")
+        colors = inner.take("faces", read=Table.text) == "colors"
+        if colors and table.source.bands is not None:
+            raise inner.fail(
+                "faces", "colors", "values in the bands of wavelength", "give a file (F, bands), or leave out [bands]"
+            )
+        if colors and "file" not in table.values:
+            raise inner.fail("faces", "colors", "a mesh, whose file has them", 'write shape = "mesh" and file = "..."')
+        if colors:
+            with table.checked():
+                values = read_face_colors(table.source.folder / table.values["file"])
+        else:
+            values = _numbers(inner, "faces")
+        inner.done()
+        with inner.checked():
+            return Texture.on_faces(shape, values)
+
+    return read
 
 
 def _shape(table: Table, lattice: Lattice) -> Shape:
@@ -206,6 +243,19 @@ def _array(table: Table, key: str, name_key: str) -> np.ndarray:
     name = table.take(name_key, None, Table.text)
     with table.checked():
         return read_volume(file, name)
+
+
+def _numbers(table: Table, key: str) -> np.ndarray:
+    """An array of any shape from a .npy file."""
+    file = table.source.folder / table.take(key, read=Table.text)
+    if file.suffix.lower() != ".npy":
+        raise table.fail(key, file.name, "a file .npy", "np.save writes one")
+    if not file.is_file():
+        raise table.fail(key, file.name, "a file that exists", "files are looked for beside the scene's")
+    try:
+        return np.load(file, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise table.fail(key, file.name, f"an array of numbers ({error})", "write it again with np.save") from error
 
 
 def _or_array(read: Callable, lattice: Lattice) -> Callable:
@@ -333,7 +383,7 @@ def _axis(table: Table, key: str, value: Any) -> Any:
 def _side(table: Table, key: str, value: Any) -> Any:
     if isinstance(value, dict):
         wall = Table(value, (*table.path, key), table.source)
-        albedo, emission = wall.take("albedo", 0.5, Table.numbers), wall.take("emission", 0.0, Table.numbers)
+        albedo, emission = wall.take("albedo", 0.5, _albedo_of(None)), wall.take("emission", 0.0, Table.numbers)
         wall.done()
         with wall.checked():
             return Wall(albedo, emission)

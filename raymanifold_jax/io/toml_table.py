@@ -168,6 +168,12 @@ class Table:
         """Three lengths."""
         return self._triple(key, value, self.length)
 
+    def places(self, key: str, value: Any) -> list[float]:
+        """A list of lengths."""
+        if not isinstance(value, list):
+            raise self.fail(key, value, "a list of lengths", f"write {key} = [0.0, 0.0]")
+        return [self.length(key, v) for v in value]
+
     def angle(self, key: str, value: Any) -> float:
         """In radians; a bare number is in degrees."""
         if isinstance(value, str):
