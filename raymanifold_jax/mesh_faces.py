@@ -20,6 +20,7 @@ from .mesh import Mesh
 from .shapes import Rotated, Shape, Translated
 
 _CORNERS = np.stack(np.meshgrid(*[[0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+_FINEST = 128  # cells along the longest side: the exact distance sees finer
 _SAMPLES = 1 << 26
 
 
@@ -48,13 +49,13 @@ def face_map(shape: Shape) -> FaceMap:
     from scipy.spatial import KDTree
 
     mesh, corners = _mesh(shape), _corners(shape)
-    cell = float(mesh.cell)
     lower, upper = corners.min((0, 1)), corners.max((0, 1))
+    cell = max(float(mesh.cell), float((upper - lower).max()) / _FINEST)
     count = np.ceil((upper - lower) / cell).astype(int) + 3
     origin = lower - cell
     sample, face = _samples(corners, cell / 2)
     nearest = np.zeros(count, np.int32)
-    nodes = np.unique(_around(np.floor((sample - origin) / cell).astype(int), count), axis=0)
+    nodes = _around(np.floor((sample - origin) / cell).astype(int), count)
     nearest[tuple(nodes.T)] = face[KDTree(sample).query(origin + nodes * cell)[1]]
     return FaceMap(corners, nearest, origin, np.asarray(cell))
 
@@ -96,11 +97,17 @@ def _samples(corners: np.ndarray, step: float) -> tuple[np.ndarray, np.ndarray]:
     return points, face
 
 
-def _around(voxel: np.ndarray, count: np.ndarray) -> np.ndarray:
+def _around(voxel: Int[np.ndarray, "n 3"], count: np.ndarray) -> Int[np.ndarray, "m 3"]:
     """The nodes of voxels and of their neighbours: a point of the surface may be rounded into one of those."""
-    voxel = np.unique(voxel, axis=0)
-    steps = np.stack(np.meshgrid(*[[-1, 0, 1, 2]] * 3, indexing="ij"), -1).reshape(-1, 3)
-    return np.clip(np.unique((voxel[:, None] + steps).reshape(-1, 3), axis=0), 0, count - 1)
+    near = np.zeros(count, bool)
+    near[tuple(voxel.T)] = True
+    for axis in range(3):
+        along = np.moveaxis(near, axis, 0)
+        before = along.copy()
+        along[:-1] |= before[1:]
+        along[1:] |= before[:-1]
+        along[2:] |= before[:-2]
+    return np.argwhere(near)
 
 
 def _square_distance(xp: Any, corners: Any, points: Any) -> Any:
