@@ -147,10 +147,34 @@ def test_lines_past_long_values(tmp_path):
     assert table.source.lines == expected
 
 
+SKIES = """\
+format = 1
+[lattice]
+shape = [4, 4, 4]
+spacing = 0.25
+[boundary]
+x = { albedo = { texture = "floor.npy", axis = "x", lower = [0, 0], upper = [1, "1 m"] } }
+[[lights]]
+kind = "sky"
+cie = 12
+elevation = 30
+azimuth = "1 rad"
+irradiance = [1, 2]
+ground = 0.1
+up = [0, 0, 1]
+[[lights]]
+kind = "sky"
+cie = 4
+direction = [0, 0, -1]
+radiance = 2.0
+"""
+
+
 @settings(max_examples=400, deadline=None)
 @given(data=st.data())
 def test_random_damage_gives_a_scene_or_an_error(tmp_path_factory, data):
-    lines = EXAMPLE.split("\n")
+    np.save(tmp_path_factory.getbasetemp() / "floor.npy", np.full((2, 2, 2), 0.5))
+    lines = data.draw(st.sampled_from([EXAMPLE, SKIES])).split("\n")
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(lines) - 1))
         kind = data.draw(st.sampled_from(["drop", "junk", "swap", "value", "cut"]))
