@@ -12,6 +12,7 @@ import numpy as np
 
 from . import checks
 from .scene import SIDES, PointLight, Scene, Sky, Sun, Wall
+from .skies import CieSky
 from .texture import Texture
 
 _LIGHTS = {Sky: ("radiance", "hemisphere"), Sun: ("direction", "irradiance"), PointLight: ("position", "intensity")}
@@ -60,6 +61,8 @@ def _shown(part: Any, *names: str) -> str:
             continue
         if isinstance(value, Texture):
             text = f"a texture of {value.values.size} numbers"
+        elif isinstance(value, CieSky):
+            text = f"of the CIE sky {value.kind}, {_shown(value, 'zenith', 'ground', 'sun_direction')}"
         elif callable(value):
             text = f"a {type(value).__name__}"
         elif checks.is_traced(value):

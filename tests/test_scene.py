@@ -28,6 +28,7 @@ from raymanifold_jax.scene import (
     Wall,
 )
 from raymanifold_jax.shapes import Box, HalfSpace, Sphere
+from raymanifold_jax.skies import cie
 from raymanifold_jax.texture import Texture
 
 LATTICE = Lattice((2, 3, 4))
@@ -288,14 +289,21 @@ def test_notebooks_show_every_part():
     assert list(rows) == ["lattice", *parts, "x-", "x+", "y-", "y+", "z-", "z+", "bands"]
     assert rows["lights[1]"] == "Sun: direction 0.6, 0, -0.8; irradiance 2"
     assert (rows["y-"], rows["z+"], rows["bands"]) == ("periodic", "open", "3") and rows["z-"].startswith("wall: albedo 0")
-    lights = [Sky(lambda w: w[:, 2] ** 2), Sky(np.ones((4, 8))), PointLight((1, 1, 2))]
+    lights = [Sky(lambda w: w[:, 2] ** 2), Sky(np.ones((4, 8))), PointLight((1, 1, 2)), Sky(cie(12, (0, 0, -1), 2))]
     floor = Wall(Texture(np.full((3, 5), 0.5)))
     html = Scene(
         LATTICE, [Solid(HalfSpace((0, 0, 1), (0, 0, 1)))], lights=lights, boundary=Boundary(z=(floor, OPEN))
     )._repr_html_()
-    for text in ("a DirectionFunction", "1 to 1 (4 x 8 numbers)", "a texture of 15 numbers", "vacuum", "HalfSpace, (-inf"):
+    for text in (
+        "a DirectionFunction",
+        "1 to 1 (4 x 8 numbers)",
+        "a texture of 15 numbers",
+        "vacuum",
+        "HalfSpace, (-inf",
+        "CIE sky 12, zenith 2",
+    ):
         assert text in html
-    assert html.count("<tr>") == html.count("</td></tr>") == 12
+    assert html.count("<tr>") == html.count("</td></tr>") == 13
 
 
 @pytest.mark.parametrize(
