@@ -1,5 +1,7 @@
 """Albedos that a mesh has face by face: found at points, averaged over elements, differentiated, kept in files."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -73,7 +75,7 @@ def test_elements_have_the_mean_of_their_faces():
 
 def test_gradient_in_the_values_of_faces():
     # Albedos of elements are linear in them, and each element's weights add up to 1.
-    scene = rm.Scene(problems.cube(10), [rm.Solid(MESH, rm.Texture.on_faces(MESH, ALBEDO))])
+    scene: Any = rm.Scene(problems.cube(10), [rm.Solid(MESH, rm.Texture.on_faces(MESH, ALBEDO))])
     surfaces = find_surfaces(scene)
 
     def total(values):
