@@ -66,7 +66,7 @@ _MODULE_OF = {
     "render": "render",
     "render_layers": "render",
 }
-_SUBMODULES = ("io", "quadrature", "scenes", "spectra")
+_SUBMODULES = ("io", "quadrature", "scenes", "skies", "spectra")
 
 __all__ = ["__version__", *_MODULE_OF, *_SUBMODULES]  # pyright: ignore[reportUnsupportedDunderAll]
 
@@ -74,6 +74,7 @@ if TYPE_CHECKING:
     from raymanifold_jax import io as io
     from raymanifold_jax import quadrature as quadrature
     from raymanifold_jax import scenes as scenes
+    from raymanifold_jax import skies as skies
     from raymanifold_jax import spectra as spectra
     from raymanifold_jax.camera import OrthographicCamera as OrthographicCamera
     from raymanifold_jax.camera import PerspectiveCamera as PerspectiveCamera

@@ -7,11 +7,14 @@ all the same) or the machine gave out; 2 for a value that cannot be used.
 Public name: `main`.
 """
 
+import itertools
 import math
 import os
 import sys
 import time
-from collections.abc import Iterable, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,11 +49,15 @@ _CACHED_FROM = 0.2  # seconds: programs that compile faster are not kept
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="raymanifold")
-def main() -> None:
+@click.pass_context
+def main(ctx: click.Context) -> None:
     """Deterministic light transport on a voxel lattice: solve a scene, and take pictures of it.
 
     Try: raymanifold render three-balls --out fog.exr
     """
+    # The library's warnings in one line each, without the place in its code.
+    ctx.with_resource(warnings.catch_warnings())
+    warnings.showwarning = _show_warning
 
 
 @main.command()
@@ -148,7 +155,9 @@ def render(
         import raymanifold_jax as rm
 
         began = time.perf_counter()
-        pictures = {view: rm.render(solution, views[view], samples=samples) for view in files}
+        shown = not (settings["quiet"] or settings["no_progress"])
+        with _rendering(len(files), shown) as done:
+            pictures = {view: rm.render(solution, views[view], samples=samples, progress=done()) for view in files}
         more = {view: rm.render_layers(solution, views[view]) if layers else {} for view in files}
         render_seconds = time.perf_counter() - began
         seen = {view: _visible(scene, picture) for view, picture in pictures.items()}
@@ -280,6 +289,11 @@ def cost(scene: "SceneEntry", size: int | None, pe: tuple[int, int], half_width:
         click.echo(str(rm.cost_report(scene.build(size or scene.default_size), scheme, pe)))
 
 
+def _show_warning(message: Warning | str, category: type[Warning], *place: Any) -> None:
+    if issubclass(category, UserWarning):
+        click.echo(f"Warning: {message}", err=True)
+
+
 def _start(pe: tuple[int, int] | None) -> None:
     """Have JAX start with as many devices as are asked for, before anything else makes it start."""
     if pe is not None:
@@ -371,6 +385,23 @@ def _auto_exposure(pictures: "Iterable[np.ndarray]") -> float:
 
     bright = float(np.percentile(np.concatenate([picture.ravel() for picture in pictures]), _BRIGHT_SHARE))
     return min(max(math.log2(_BRIGHT / bright), -100.0), 100.0) if bright > 0 else 0.0
+
+
+@contextmanager
+def _rendering(count: int, shown: bool) -> Iterator[Callable[[], Callable[[float], None] | None]]:
+    """A bar on a terminal for `count` pictures; what it gives, called once a picture, takes the share of it that is done."""
+    if not (shown and sys.stderr.isatty()):
+        yield lambda: None
+        return
+    steps = 1000
+    with click.progressbar(length=count * steps, label="render", file=sys.stderr) as bar:
+        pictures = itertools.count()
+
+        def one() -> Callable[[float], None]:
+            before = next(pictures) * steps
+            return lambda share: bar.update(before + round(share * steps) - bar.pos)
+
+        yield one
 
 
 def _report(entry: "SceneEntry", solution: "Solution", seconds: Mapping[str, float]) -> None:

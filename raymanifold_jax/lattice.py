@@ -36,9 +36,13 @@ class Lattice(eqx.Module):
 
     def __init__(self, shape: Any, spacing: Any = 1.0, origin: Any = (0, 0, 0)):
         advice = "pass three ints, as in (64, 64, 64)"
-        if np.ndim(shape) != 1 or len(shape) != 3:
+        try:
+            sizes = () if isinstance(shape, str) else tuple(shape)
+        except TypeError:  # nothing to go through
+            sizes = ()
+        if len(sizes) != 3:
             checks.fail("shape", shape, "the numbers of voxels along x, y and z", advice)
-        nx, ny, nz = (checks.positive_int(f"shape[{axis}]", n) for axis, n in enumerate(shape))
+        nx, ny, nz = (checks.positive_int(f"shape[{axis}]", n) for axis, n in enumerate(sizes))
         self.shape = (nx, ny, nz)
         for name, value in (("spacing", spacing), ("origin", origin)):
             if checks.is_traced(value):

@@ -9,7 +9,7 @@ with h the grid's cell; continuous with its gradient, which is given at length 1
 grid. Surface elements do not depend on it where the mesh is closed: they are made of the triangles themselves
 (`mesh_elements`).
 
-Public names: `Mesh`, `MeshReport`.
+Public names: `Mesh`, `MeshReport`; `read_triangles`, `has_area` for this package.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from . import checks
 from .mesh_distance import SampledDistance, sample_distance
@@ -289,15 +289,19 @@ def _checked(vertices: Any, faces: Any) -> tuple[np.ndarray, np.ndarray, int]:
     # Vertices at one place are one vertex: files such as STL repeat them.
     vertices, number = np.unique(vertices, axis=0, return_inverse=True)
     index = number.reshape(-1)[index].astype(np.int64)
-    corners = vertices[index]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    size = float(np.ptp(vertices, axis=0).max())
-    real = np.linalg.norm(normal, axis=1) > 1e-24 * size**2
-    distinct = (index != np.roll(index, 1, axis=1)).all(1)
-    kept = index[real & distinct]
+    kept = index[has_area(vertices, index)]
     if not len(kept):
         checks.fail("faces", f"{len(index)} triangles without any area", "a surface", "check scale and indices")
     return vertices, kept, int(len(index) - len(kept))
+
+
+def has_area(vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]) -> Bool[np.ndarray, " F"]:
+    """Which triangles a `Mesh` keeps."""
+    corners = vertices[faces]
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = float(np.ptp(vertices, axis=0).max())
+    distinct = (corners != np.roll(corners, 1, axis=1)).any(-1).all(1)
+    return (np.linalg.norm(normal, axis=1) > 1e-24 * size**2) & distinct
 
 
 def _topology(vertices: np.ndarray, faces: np.ndarray, degenerate: int) -> MeshReport:
@@ -324,6 +328,12 @@ def _topology(vertices: np.ndarray, faces: np.ndarray, degenerate: int) -> MeshR
 
 
 def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
+    loaded = read_triangles(path)
+    return np.asarray(loaded.vertices, float), np.asarray(loaded.faces)
+
+
+def read_triangles(path: str | os.PathLike[str]) -> Any:
+    """A file as a `trimesh.Trimesh`. **Raises** as `Mesh.load` does."""
     path = Path(path)
     if not path.is_file():
         checks.fail("path", repr(str(path)), "a file that exists", "check its spelling", FileNotFoundError)
@@ -335,7 +345,7 @@ def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
         raise ImportError("Mesh.load needs trimesh; pip install 'raymanifold-jax[mesh]'") from error
     try:
         loaded = trimesh.load(path, force="mesh", process=False)
-        vertices, faces = np.asarray(loaded.vertices, float), np.asarray(loaded.faces)  # pyright: ignore
+        faces = np.asarray(loaded.faces)  # pyright: ignore[reportAttributeAccessIssue]
     except Exception as error:  # each of its readers fails in its own ways
         raise ValueError(
             f"path: got {str(path)!r}, which cannot be read ({type(error).__name__}: {error}), expected a whole "
@@ -343,4 +353,4 @@ def _read(path: str | os.PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
         ) from error
     if not len(faces):
         checks.fail("path", f"{str(path)!r} without triangles", "a surface", "point clouds have none: make a mesh of it first")
-    return vertices, faces
+    return loaded

@@ -130,7 +130,7 @@ class Sky(eqx.Module):
           azimuth 0 (+x), azimuth increasing towards +y. Pixel (i, j) is centred at polar angle pi (i + 1/2) / h and
           azimuth pi (j + 1/2) / h; between centres it is interpolated, across the seam and the poles too;
         - a function of the directions *towards* the sky, (n, 3) -> (n,) or (n, bands), written in `jax.numpy`. A plain
-          function is static; an `equinox.Module` that can be called keeps its leaves.
+          function is static; an `equinox.Module` that can be called keeps its leaves. `rm.skies` has the CIE standard skies.
     - `hemisphere`: if given, only the half of the sky around this direction (3,) shines.
     """
 
@@ -349,6 +349,12 @@ class Scene(eqx.Module):
             f"{axis} {a}" if a == b else f"{axis} {a}/{b}" for axis, a, b in zip("xyz", sides[::2], sides[1::2], strict=True)
         )
         return ", ".join(parts) + "; sides " + ", ".join(axes)
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows."""
+        from .display import scene_html
+
+        return scene_html(self)
 
 
 SIDES = ("x-", "x+", "y-", "y+", "z-", "z+")

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Mapping
-from html import escape
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -146,15 +145,13 @@ class Solution(eqx.Module):
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""
+        from .display import html_table
+
         energy = {name.replace("_", " "): float(value) for name, value in self.energy._asdict().items()}
         rows = {"scene": self.scene.summary(), "result": self.result}
         rows |= {f"{name}, W": f"{value:.6g}" for name, value in energy.items()}
         rows["imbalance"] = f"{100 * float(self.energy.imbalance):+.3f} %"
-        cells = (
-            f"<tr><th style='text-align:left'>{k}</th><td style='text-align:left'>{escape(v)}</td></tr>"
-            for k, v in rows.items()
-        )
-        return f"<table>{''.join(cells)}</table>"
+        return html_table(list(rows.items()))
 
     @property
     def elements(self) -> Surfaces:

@@ -18,6 +18,8 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import os
+import sys
+import warnings
 from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
@@ -188,8 +190,12 @@ def _comma(wavelength: float) -> str:
 
 
 def _colour() -> Any:
-    import colour
-
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # that its plots need matplotlib
+        import colour
+    # Without matplotlib it leaves stand-ins for it, on which anything can be called: others would take them for matplotlib.
+    for name in [name for name, module in sys.modules.items() if type(module).__name__ == "MagicMock"]:
+        del sys.modules[name]
     return colour
 
 

@@ -1,15 +1,15 @@
-"""Values that vary over surfaces: textures on an axis-aligned rectangle.
+"""Values that vary over surfaces: textures on an axis-aligned rectangle, and values of the triangles of a mesh.
 
 A texture is a grid of values looked at along one axis of the scene: a surface point x takes the value of the cell it projects
 into. Cells are constant inside, so that a value is what a fit of one cell means; points off the rectangle take the nearest
-cell. A surface element has the mean over its face, by area.
+cell. `Texture.on_faces` gives each triangle of a mesh a value instead. A surface element has the mean over its face, by area.
 
 Public: `Texture`; `value_at`, `mean_values` for this package.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
@@ -19,6 +19,10 @@ from jaxtyping import Array, Float, Int
 
 from . import checks
 from .lattice import Lattice
+from .shapes import Shape
+
+if TYPE_CHECKING:
+    from .mesh_faces import FaceMap
 
 _AXES = ("x", "y", "z")
 
@@ -39,6 +43,7 @@ class Texture(eqx.Module):
     values: Float[jax.Array, "nu nv *bands"]
     lower: Float[np.ndarray, " 2"] | None
     upper: Float[np.ndarray, " 2"] | None
+    faces: FaceMap | None
     axis: str = eqx.field(static=True)
 
     def __init__(self, values: Any, axis: str = "z", lower: Any = None, upper: Any = None):
@@ -54,7 +59,27 @@ class Texture(eqx.Module):
             checks.fail("upper", upper, f"more than lower, {corners[0].tolist()}, along both axes", "swap them")
         self.values = jnp.asarray(numbers, float)
         self.lower, self.upper = corners
+        self.faces = None
         self.axis = axis
+
+    @classmethod
+    def on_faces(cls, mesh: Shape, values: Any) -> Texture:
+        """A value for each triangle of a mesh: (F,) or (F, bands), in the order of `mesh.faces`.
+
+        `mesh`: an `rm.Mesh` as it stands in the scene, also moved or turned. The texture has `values` (F, 1[, bands]).
+
+        **Raises** `ValueError` for another number of values, `TypeError` for another shape.
+        """
+        from .mesh_faces import face_map
+
+        faces = face_map(mesh)
+        numbers, count = checks.non_negative("values", values), len(faces.corners)
+        if numbers.ndim not in (1, 2) or len(numbers) != count or 0 in numbers.shape:
+            expected = f"({count},) or ({count}, bands), one value for each row of mesh.faces"
+            checks.fail(
+                "values", f"an array of shape {numbers.shape}", expected, "triangles without area are no part of a mesh"
+            )
+        return eqx.tree_at(lambda t: t.faces, cls(numbers[:, None]), faces, is_leaf=lambda x: x is None)
 
     @property
     def ndim(self) -> int:
@@ -67,7 +92,10 @@ class Texture(eqx.Module):
         return self.values.shape[2:]
 
     def cell(self, lattice: Lattice, points: Any) -> tuple[Int[Any, " n"], Int[Any, " n"]]:
-        """The cells (i, j) that points (n, 3) in scene units project into."""
+        """The cells (i, j) that points (n, 3) in scene units project into, or (face, 0)."""
+        if self.faces is not None:
+            face = self.faces(points)
+            return face, 0 * face
         along = [k for k in range(3) if k != _AXES.index(self.axis)]
         lower = lattice.lower[along] if self.lower is None else self.lower
         upper = lattice.upper[along] if self.upper is None else self.upper

@@ -1,9 +1,12 @@
 """The command line: quick help, every bad value refused in one line before any work, and pictures that say their settings."""
 
 import dataclasses
+import io
 import os
+import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -51,7 +54,9 @@ class Library:
             raise self.error
         return FakeSolution(scene, self.converged)
 
-    def render(self, solution, camera, samples):
+    def render(self, solution, camera, samples, progress=None):
+        if progress is not None:
+            progress(1.0)
         self.views.append((camera, samples))
         width, height = camera.resolution
         return np.linspace(0, 2, width * height, dtype=np.float32).reshape(height, width)
@@ -176,6 +181,39 @@ def test_defaults(library, tmp_path):
 def test_progress(library, options, progress):
     assert run("solve", "ring", "--size", "8", *options).exit_code == 0
     assert library.asked[0]["progress"] is progress
+
+
+def test_a_bar_while_pictures_are_made(library, monkeypatch):
+    monkeypatch.setattr(cli.sys, "stderr", terminal := Terminal())
+    with cli._rendering(2, shown=True) as picture:
+        for _ in range(2):
+            done = picture()
+            assert done is not None
+            done(0.5)
+            done(1.0)
+    assert re.findall(r"(\d+)%", terminal.getvalue())[-1] == "100" and "50%" in terminal.getvalue()
+    with cli._rendering(2, shown=False) as picture:
+        assert picture() is None
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_warnings_take_one_line(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    ball = trimesh.creation.icosphere(2, radius=0.3)
+    ball.update_faces(np.arange(len(ball.faces)) > 0)
+    ball.export(tmp_path / "ball.ply")
+    text = "format = 1\n[lattice]\nshape = [8, 8, 8]\nspacing = 0.125\n[[solids]]\nshape = 'mesh'\nfile = 'ball.ply'\n"
+    (tmp_path / "a.toml").write_text(text + "fit_lower = [0.2, 0.2, 0.2]\nfit_upper = [0.8, 0.8, 0.8]\n")
+    before = warnings.showwarning
+    result = CliRunner().invoke(cli.main, ["info", str(tmp_path / "a.toml")])
+    assert result.exit_code == 0, result.output
+    (line,) = (line for line in result.stderr.splitlines() if "3 edges of holes" in line)
+    assert line.startswith("Warning: Mesh: 3 edges") and ".py" not in result.stderr
+    assert warnings.showwarning is before
 
 
 def test_all_views_share_one_exposure(library, tmp_path):

@@ -58,6 +58,7 @@ def test_is_static():
     [
         ({"shape": 8}, ValueError, "shape: got 8"),
         ({"shape": (8, 8)}, ValueError, r"shape: got \(8, 8\)"),
+        ({"shape": [8, []]}, ValueError, r"shape: got \[8, \[\]\]"),
         ({"shape": (8, 8, 0)}, ValueError, r"shape\[2\]: got 0"),
         ({"shape": (8.0, 8, 8)}, TypeError, r"shape\[0\]: got 8.0"),
         ({"shape": (8, True, 8)}, TypeError, r"shape\[1\]: got True"),

@@ -45,9 +45,19 @@ LIGHTS = st.one_of(
     st.tuples(st.just(rm.Sun), VECTORS, VALUES),
     st.tuples(st.just(rm.PointLight), VECTORS, VALUES),
 )
+KINDS = st.one_of(st.integers(-1, 18), NUMBERS)
+MESH = rm.Mesh(
+    np.array([(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]), np.array([(0, 2, 1), (0, 1, 3), (0, 3, 2), (1, 2, 3)]), 8
+)
 PARTS = st.one_of(
     SHAPES,
     LIGHTS,
+    st.tuples(st.just(rm.skies.cie), KINDS, VECTORS, VALUES, st.one_of(st.none(), VALUES), VECTORS, VALUES),
+    st.tuples(st.just(rm.skies.cie), KINDS, VECTORS, st.none(), VALUES),
+    st.tuples(st.just(rm.Texture), VALUES, st.sampled_from(["x", "z", "w", 1]), VECTORS, VECTORS),
+    st.tuples(
+        st.just(rm.Texture.on_faces), st.sampled_from([MESH, MESH.translate((1, 0, 0)), rm.Box((0, 0, 0), (1, 1, 1))]), VALUES
+    ),
     st.tuples(st.just(rm.Lattice), st.one_of(VECTORS, st.lists(st.integers(-1, 9), min_size=3, max_size=3)), NUMBERS, VECTORS),
     st.tuples(st.just(rm.Wall), VALUES, VALUES),
     st.tuples(st.just(rm.Medium), VALUES, VALUES, VALUES),

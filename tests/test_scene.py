@@ -5,6 +5,7 @@
 
 import copy
 import pickle
+import re
 
 import equinox as eqx
 import jax
@@ -26,7 +27,9 @@ from raymanifold_jax.scene import (
     Sun,
     Wall,
 )
-from raymanifold_jax.shapes import Box, Sphere
+from raymanifold_jax.shapes import Box, HalfSpace, Sphere
+from raymanifold_jax.skies import cie
+from raymanifold_jax.texture import Texture
 
 LATTICE = Lattice((2, 3, 4))
 BALL = Sphere((1, 1, 1), 0.5)
@@ -276,6 +279,31 @@ def test_summary():
     for word in ("2 x 3 x 4", "2 solids", "medium", "Sky + Sun + PointLight", "3 bands", "y periodic", "z wall/open"):
         assert word in summary
     assert "vacuum" in Scene(LATTICE).summary() and "bands" not in Scene(LATTICE).summary()
+
+
+def test_notebooks_show_every_part():
+    """One row a part, with its numbers; whatever a value is, it is shown, and nothing in it is taken for HTML."""
+    html = full_scene()._repr_html_()
+    rows = dict(re.findall(r"<tr><th[^>]*>(.*?)</th><td[^>]*>(.*?)</td></tr>", html))
+    parts = ("solids[0]", "solids[1]", "medium", "lights[0]", "lights[1]", "lights[2]")
+    assert list(rows) == ["lattice", *parts, "x-", "x+", "y-", "y+", "z-", "z+", "bands"]
+    assert rows["lights[1]"] == "Sun: direction 0.6, 0, -0.8; irradiance 2"
+    assert (rows["y-"], rows["z+"], rows["bands"]) == ("periodic", "open", "3") and rows["z-"].startswith("wall: albedo 0")
+    lights = [Sky(lambda w: w[:, 2] ** 2), Sky(np.ones((4, 8))), PointLight((1, 1, 2)), Sky(cie(12, (0, 0, -1), 2))]
+    floor = Wall(Texture(np.full((3, 5), 0.5)))
+    html = Scene(
+        LATTICE, [Solid(HalfSpace((0, 0, 1), (0, 0, 1)))], lights=lights, boundary=Boundary(z=(floor, OPEN))
+    )._repr_html_()
+    for text in (
+        "a DirectionFunction",
+        "1 to 1 (4 x 8 numbers)",
+        "a texture of 15 numbers",
+        "vacuum",
+        "HalfSpace, (-inf",
+        "CIE sky 12, zenith 2",
+    ):
+        assert text in html
+    assert html.count("<tr>") == html.count("</td></tr>") == 13
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ Everything here is exact, or to rounding in single precision (relative 1e-7).
 import contextlib
 import re
 import tomllib
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -62,6 +63,23 @@ def test_the_example(tmp_path):
     assert len(load(tmp_path, text).cameras) == 2
 
 
+def test_the_scene_in_the_readme(tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    (text,) = re.findall(r"```toml\n(.*?)```", (Path(__file__).parents[1] / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    trimesh.creation.icosphere(2).export(tmp_path / "model.ply")
+    file: Any = load(tmp_path, text.replace("resolution = 256", "resolution = 16"))
+    scene = file.scene
+    assert scene.summary().startswith("80 x 80 x 40 voxels of 0.025, 1 solid, medium, light: Sun + Sky, 3 bands")
+    lower, upper = scene.solids[0].shape.bounds()
+    np.testing.assert_allclose((lower, upper), ((0.6, 0.6, 0), (1.4, 1.4, 0.8)), atol=1e-6)
+    # The eye is outside of the box, and looks at the model.
+    eye, way = file.cameras["camera1"](scene.lattice, (9, 9)).rays(1, (4, 5))
+    eye, way = np.asarray(eye)[0, 4, 0], np.asarray(way)[0, 4, 0]
+    assert not scene.lattice.contains(eye).any()
+    along = eye + np.linspace(0, 4, 200)[:, None] * way
+    assert scene.distance(along).min() < 0
+
+
 def test_units(tmp_path):
     text = SMALL.replace("spacing = 0.25", 'spacing = "25 mm"\nlength_unit = "cm"\norigin = [0, "1 m", "1e-2m"]')
     text += '[medium]\nscattering = "300 /m"\nabsorption = ["1 1/cm", 2.0]\n'
@@ -100,7 +118,9 @@ def test_size(tmp_path):
         (SMALL + "\n[[solids]]\nshape = 'ball'\n", 7, r"solids\[0\]\.shape: got ball, expected one of sphere, box"),
         (SMALL + "\n[[solids]]\nshape = 'sphere'\nradius = 1\n", 6, r"solids\[0\]: got no center"),
         (SMALL + "# [[\n[[lights]]\nkind='sky'\n[[lights]]\nkind='sun'\ndirection=[0,0,0]\n", 10, r"lights\[1\]: direction"),
-        (SMALL + "[[lights]]\nkind = 'sun'\n", 5, r"lights\[0\]: got both or neither of direction"),
+        (SMALL + "[[lights]]\nkind = 'sun'\n", 5, r"lights\[0\]: got neither of direction and elevation"),
+        (SMALL + "[[lights]]\nkind = 'sun'\nazimuth = 3\n", 5, r"lights\[0\]: got one of elevation and azimuth"),
+        (SMALL + "[[lights]]\nkind = 'sun'\nazimuth = 3\ndirection = [1, 0, 0]\n", 5, r"lights\[0\]: got both of direction"),
         (SMALL + "[boundary]\nx = 'opne'\n", 6, r"boundary\.x: got opne, expected open, mirror, periodic or a wall"),
         (SMALL + "[boundary]\nx = [\n 'open',\n 'periodic']\n", 6, r"boundary: x: got .*PERIODIC on both sides"),
         (SMALL + "[boundary]\nx = { albedo = 1.5 }\n", 6, r"boundary\.x: albedo: got 1\.5"),
@@ -127,10 +147,34 @@ def test_lines_past_long_values(tmp_path):
     assert table.source.lines == expected
 
 
+SKIES = """\
+format = 1
+[lattice]
+shape = [4, 4, 4]
+spacing = 0.25
+[boundary]
+x = { albedo = { texture = "floor.npy", axis = "x", lower = [0, 0], upper = [1, "1 m"] } }
+[[lights]]
+kind = "sky"
+cie = 12
+elevation = 30
+azimuth = "1 rad"
+irradiance = [1, 2]
+ground = 0.1
+up = [0, 0, 1]
+[[lights]]
+kind = "sky"
+cie = 4
+direction = [0, 0, -1]
+radiance = 2.0
+"""
+
+
 @settings(max_examples=400, deadline=None)
 @given(data=st.data())
 def test_random_damage_gives_a_scene_or_an_error(tmp_path_factory, data):
-    lines = EXAMPLE.split("\n")
+    np.save(tmp_path_factory.getbasetemp() / "floor.npy", np.full((2, 2, 2), 0.5))
+    lines = data.draw(st.sampled_from([EXAMPLE, SKIES])).split("\n")
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(lines) - 1))
         kind = data.draw(st.sampled_from(["drop", "junk", "swap", "value", "cut"]))
@@ -317,6 +361,90 @@ def test_a_sky_image_is_seen_the_right_way_round(tmp_path):
     towards = np.array([[np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)]])
     np.testing.assert_allclose(scene.lights[0].radiance_along(-towards), [[1, 2, 3]], rtol=1e-5)
     np.testing.assert_allclose(scene.lights[0].radiance_along(-towards * [1, -1, 1]), 0, atol=1e-6)
+
+
+# Values that vary over surfaces
+
+
+def coloured_box(folder):
+    """A box of six coloured sides, as other programs write it: each face an sRGB colour of its own."""
+    trimesh = pytest.importorskip("trimesh")
+    box = trimesh.creation.box((1, 1, 1))
+    colors = np.random.default_rng(1).integers(0, 256, (12, 4))
+    box.visual = trimesh.visual.ColorVisuals(box, face_colors=np.where([True, True, True, False], colors, 255).astype(np.uint8))
+    box.export(folder / "box.ply")
+    return box
+
+
+MESH = (
+    SMALL
+    + """\
+[[solids]]
+shape = "mesh"
+file = "box.ply"
+resolution = 32
+fit_lower = [0.2, 0.2, 0.2]
+fit_upper = [0.8, 0.8, 0.8]
+"""
+)
+
+
+def test_a_mesh_with_the_colours_of_its_file(tmp_path):
+    box = coloured_box(tmp_path)
+    scene: Any = load(tmp_path, MESH + 'albedo = { faces = "colors" }\n').scene
+    assert scene.bands == 3
+    texture = scene.solids[0].albedo
+    middle = 0.5 + 0.6 * np.asarray(box.triangles_center)
+    found = np.asarray(texture.values)[texture.cell(scene.lattice, middle)]
+    np.testing.assert_allclose(rm.io.to_srgb8(found[None])[0], box.visual.face_colors[:, :3], atol=1)
+
+
+def test_textures_come_back(tmp_path):
+    coloured_box(tmp_path)
+    rng = np.random.default_rng(0)
+    np.save(tmp_path / "sides.npy", rng.random((12, 2)))
+    np.save(tmp_path / "floor.npy", rng.random((3, 4, 2)))
+    text = MESH + 'albedo = { faces = "sides.npy" }\n[boundary]\n'
+    text += 'z = [{ albedo = { texture = "floor.npy", lower = ["10 cm", 0], upper = [0.9, 1] } }, "open"]\n'
+    scene: Any = load(tmp_path, text + 'x = { albedo = { texture = "floor.npy", axis = "x" } }\n').scene
+    rm.io.save_scene(tmp_path / "again.toml", scene)
+    again: Any = rm.io.load_scene(tmp_path / "again.toml").scene
+    x = rng.random((200, 3)) * 0.6 + 0.2
+    x[np.arange(200), rng.integers(0, 3, 200)] = rng.choice([0.2, 0.8], 200)
+    for before, after in (
+        (scene.solids[0].albedo, again.solids[0].albedo),
+        (scene.boundary.sides[4].albedo, again.boundary.sides[4].albedo),
+        (scene.boundary.sides[1].albedo, again.boundary.sides[1].albedo),
+    ):
+        values = [np.asarray(t.values)[t.cell(scene.lattice, x)] for t in (before, after)]
+        np.testing.assert_allclose(*values, rtol=1e-7)
+        assert np.ptp(values[0]) > 0.5
+
+
+@pytest.mark.parametrize(
+    ("rows", "line", "message"),
+    [
+        ('albedo = { faces = "no.npy" }\n', 11, r"solids\[0\]\.albedo\.faces: got no\.npy, expected a file that exists"),
+        ('albedo = { faces = "junk.npy" }\n', 11, r"faces: got junk\.npy, expected an array of numbers"),
+        ('albedo = { faces = "box.ply" }\n', 11, r"faces: got box\.ply, expected a file \.npy"),
+        ('albedo = { faces = "short.npy" }\n', 11, r"values: got an array of shape \(5,\), expected \(12,\)"),
+        ('albedo = { faces = "dark.npy" }\n', 11, r"albedo\.values: got 1\.5 at index"),
+        ('albedo = { faces = "colors", fases = 1 }\n', 11, r"fases: got a name that means nothing here"),
+        ('albedo = { texture = "short.npy" }\n', 11, r"albedo: values: got an array of shape \(5,\)"),
+        ('albedo = { texture = "flat.npy", axis = "w" }\n', 11, r"axis: got 'w'"),
+        ('difference = [{ shape = "sphere", center = [0, 0, 0], radius = 1}]\nalbedo = { faces = "dark.npy" }\n', 12, "mesh:"),
+        ('[boundary]\nz = { albedo = { faces = "dark.npy" } }\n', 12, r"faces: got a wall, expected a mesh"),
+        ('albedo = { faces = "colors" }\n[bands]\nedges = [400, 500, 600]\n', 11, r"faces: got colors, expected values in the"),
+    ],
+)  # fmt: skip
+def test_textures_that_are_wrong(tmp_path, rows, line, message):
+    coloured_box(tmp_path)
+    np.save(tmp_path / "short.npy", np.full(5, 0.5))
+    np.save(tmp_path / "dark.npy", np.full(12, 1.5))
+    np.save(tmp_path / "flat.npy", np.full((2, 2), 0.5))
+    (tmp_path / "junk.npy").write_bytes(b"\x93NUMPY junk")
+    with pytest.raises(rm.io.SceneFileError, match=rf"scene\.toml:{line}: .*{message}"):
+        load(tmp_path, MESH + rows)
 
 
 # On the command line

@@ -1,5 +1,9 @@
 """Bands, spectra and colours against colour-science's own integrals, and spectral pictures in other readers."""
 
+import subprocess
+import sys
+import textwrap
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -118,3 +122,24 @@ def test_layers_that_do_not_fit(tmp_path):
     with pytest.raises(ValueError, match=r"layers\['odd'\]: got 2 channels"):
         write_spectral_exr(tmp_path / "a.exr", np.zeros((5, 7, 8)), EIGHT, layers={"odd": np.zeros((5, 7, 2))})
     assert not (tmp_path / "a.exr").exists()
+
+
+def test_nothing_stands_in_for_matplotlib():
+    # colour-science puts mocks of a missing matplotlib into sys.modules, on which plots would silently come to nothing.
+    code = """
+        import sys
+        class Without:
+            def find_spec(self, name, path=None, target=None):
+                if name.split(".")[0] == "matplotlib":
+                    raise ModuleNotFoundError(name)
+        sys.meta_path.insert(0, Without())
+        import raymanifold_jax as rm
+        rm.spectra.Bands([400, 500, 600]).illuminant("D65")
+        assert not [name for name, module in sys.modules.items() if "Mock" in type(module).__name__]
+        try:
+            import matplotlib
+        except ImportError:
+            print("none")
+    """
+    done = subprocess.run([sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "none\n", "")

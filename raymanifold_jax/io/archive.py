@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import __version__, checks, mesh, scene, shapes, solution, surfaces, texture, voxels
+from .. import __version__, checks, mesh, mesh_faces, scene, shapes, skies, solution, surfaces, texture, voxels
 from ..lattice import Lattice
 from .exr import written_atomically
 
@@ -28,9 +28,10 @@ _CLASSES: dict[str, type] = {
     kind.__name__: kind
     for kind in (
         Lattice, shapes.Sphere, shapes.Box, shapes.Torus, shapes.Cylinder, shapes.HalfSpace, shapes.Union, shapes.Intersection,
-        shapes.Difference, shapes.Translated, shapes.Rotated, mesh.Mesh, mesh.Triangles, mesh.MeshReport, voxels.Voxels,
+        shapes.Difference, shapes.Translated, shapes.Rotated, mesh.Mesh, mesh.Triangles, mesh.MeshReport, mesh_faces.FaceMap,
+        voxels.Voxels,
         scene.Solid, scene.Wall, scene.Medium, scene.Sky, scene.Sun, scene.PointLight, scene.Boundary, scene.Scene,
-        texture.Texture, surfaces.Surfaces, solution.Energy, solution.Solution, solution._Hidden,
+        skies.CieSky, texture.Texture, surfaces.Surfaces, solution.Energy, solution.Solution, solution._Hidden,
     )
 }  # fmt: skip
 

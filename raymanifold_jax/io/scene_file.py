@@ -24,9 +24,12 @@ from ..lattice import Lattice
 from ..mesh import Mesh
 from ..scene import MIRROR, OPEN, PERIODIC, Boundary, Medium, PointLight, Scene, Sky, Solid, Sun, Wall
 from ..shapes import Box, Cylinder, HalfSpace, Shape, Sphere, Torus
+from ..skies import KINDS, SUNLESS, cie
 from ..spectra import Bands
+from ..texture import Texture
 from ..voxels import Voxels
 from .exr import read_exr
+from .mesh_colors import read_face_colors
 from .toml_table import LENGTHS, SceneFileError, Table, read_toml
 from .volume import medium_from_density, read_volume, resampled
 
@@ -135,11 +138,46 @@ def _lattice(table: Table, size: int | None) -> tuple[Lattice, Lattice]:
 
 def _solid(table: Table, lattice: Lattice) -> Solid:
     shape = _shape(table, lattice)
-    albedo = table.take("albedo", 0.5, Table.numbers)
+    albedo = table.take("albedo", 0.5, _albedo_of(shape))
     emission = table.take("emission", 0.0, Table.numbers)
     table.done()
     with table.checked():
         return Solid(shape, albedo, emission)
+
+
+def _albedo_of(shape: Shape | None) -> Callable:
+    """Reads numbers, a texture, or (of a mesh) a value for each face."""
+
+    def read(table: Table, key: str, value: Any) -> Any:
+        if not (isinstance(value, dict) and ("texture" in value or "faces" in value)):
+            return Table.numbers(table, key, value)
+        inner = Table(value, (*table.path, key), table.source)
+        if inner.has("texture"):
+            values = _numbers(inner, "texture")
+            axis = inner.take("axis", "z", Table.text)
+            lower, upper = (inner.take(name, None, Table.places) for name in ("lower", "upper"))
+            inner.done()
+            with inner.checked():
+                return Texture(values, axis, lower, upper)
+        if shape is None:
+            raise inner.fail("faces", "a wall", "a mesh", "walls take { texture = ... }")
+        colors = inner.take("faces", read=Table.text) == "colors"
+        if colors and table.source.bands is not None:
+            raise inner.fail(
+                "faces", "colors", "values in the bands of wavelength", "give a file (F, bands), or leave out [bands]"
+            )
+        if colors and "file" not in table.values:
+            raise inner.fail("faces", "colors", "a mesh, whose file has them", 'write shape = "mesh" and file = "..."')
+        if colors:
+            with table.checked():
+                values = read_face_colors(table.source.folder / table.values["file"])
+        else:
+            values = _numbers(inner, "faces")
+        inner.done()
+        with inner.checked():
+            return Texture.on_faces(shape, values)
+
+    return read
 
 
 def _shape(table: Table, lattice: Lattice) -> Shape:
@@ -207,6 +245,19 @@ def _array(table: Table, key: str, name_key: str) -> np.ndarray:
         return read_volume(file, name)
 
 
+def _numbers(table: Table, key: str) -> np.ndarray:
+    """An array of any shape from a .npy file."""
+    file = table.source.folder / table.take(key, read=Table.text)
+    if file.suffix.lower() != ".npy":
+        raise table.fail(key, file.name, "a file .npy", "np.save writes one")
+    if not file.is_file():
+        raise table.fail(key, file.name, "a file that exists", "files are looked for beside the scene's")
+    try:
+        return np.load(file, allow_pickle=False)
+    except (ValueError, OSError, EOFError) as error:
+        raise table.fail(key, file.name, f"an array of numbers ({error})", "write it again with np.save") from error
+
+
 def _or_array(read: Callable, lattice: Lattice) -> Callable:
     def either(table: Table, key: str, value: Any) -> Any:
         if not (isinstance(value, str) and value.lower().endswith((".npy", ".npz", ".zarr", ".vdb"))):
@@ -235,29 +286,13 @@ def _medium(table: Table, lattice: Lattice) -> Medium:
 def _light(table: Table) -> Sky | Sun | PointLight:
     kind = table.take("kind", read=Table.text)
     if kind == "sky":
-        hemisphere = table.take("hemisphere", None, Table.vector)
-        radiance = table.take("radiance", 1.0, Table.numbers)
-        image = table.take("image", None, Table.text)
-        table.done()
-        with table.checked():
-            if image is not None:
-                factor = np.atleast_1d(np.asarray(radiance, float))
-                path = table.source.folder / image
-                if path.suffix.lower() == ".npy":
-                    radiance = np.load(path, allow_pickle=False) * (factor if factor.size > 1 else factor[0])
-                else:
-                    radiance = read_sky(path) * factor
-            return Sky(radiance, hemisphere)
+        return _sky(table)
     if kind == "sun":
-        travel = table.take("direction", None, Table.vector)
-        height, azimuth = table.take("elevation", None, Table.angle), table.take("azimuth", None, Table.angle)
+        travel = _travel(table)
         irradiance = table.take("irradiance", 1.0, Table.numbers)
         table.done()
-        if (travel is None) == (height is None or azimuth is None):
-            got = "both or neither of direction and elevation, azimuth"
-            raise table.fail(None, got, "one of them", "direction is that of travel; azimuth is counted from +x towards +y")
-        if travel is None and height is not None and azimuth is not None:
-            travel = [-math.cos(height) * math.cos(azimuth), -math.cos(height) * math.sin(azimuth), -math.sin(height)]
+        if travel is None:
+            raise table.fail(None, "neither of direction and elevation, azimuth", "one of them", _TRAVEL)
         with table.checked():
             return Sun(travel, irradiance)
     if kind == "point":
@@ -266,6 +301,57 @@ def _light(table: Table) -> Sky | Sun | PointLight:
         with table.checked():
             return PointLight(position, intensity)
     raise table.fail("kind", kind, "one of sky, sun, point", 'write kind = "sky"')
+
+
+_TRAVEL = "direction is that of travel; azimuth is counted from +x towards +y"
+
+
+def _travel(table: Table) -> list[float] | None:
+    """The direction in which sunlight travels, if the table tells where the sun is."""
+    travel = table.take("direction", None, Table.vector)
+    height, azimuth = table.take("elevation", None, Table.angle), table.take("azimuth", None, Table.angle)
+    if travel is not None and not (height is None and azimuth is None):
+        raise table.fail(None, "both of direction and elevation, azimuth", "one of them", _TRAVEL)
+    if (height is None) != (azimuth is None):
+        raise table.fail(None, "one of elevation and azimuth", "both", _TRAVEL)
+    if height is None or azimuth is None:
+        return travel
+    return [-math.cos(height) * math.cos(azimuth), -math.cos(height) * math.sin(azimuth), -math.sin(height)]
+
+
+def _sky(table: Table) -> Sky:
+    hemisphere = table.take("hemisphere", None, Table.vector)
+    image, kind = table.take("image", None, Table.text), table.take("cie", None, Table.whole)
+    if kind is not None:
+        if image is not None:
+            raise table.fail("cie", kind, "one of cie and image", "leave one out")
+        travel = _travel(table)
+        values = {key: table.take(key, None, Table.numbers) for key in ("radiance", "irradiance")}
+        up, ground = table.take("up", [0.0, 0.0, 1.0], Table.vector), table.take("ground", 0.0, Table.numbers)
+        table.done()
+        if None not in values.values():
+            raise table.fail(
+                "irradiance", values["irradiance"], "one of radiance (at the zenith) and irradiance", "leave one out"
+            )
+        if travel is None and kind in KINDS and kind not in SUNLESS:
+            raise table.fail(None, "no sun", "elevation and azimuth of the sun, or direction", _TRAVEL)
+        with table.checked(kind="cie", zenith="radiance", sun_direction="elevation" if table.has("elevation") else "direction"):
+            return Sky(cie(kind, travel, values["radiance"], values["irradiance"], up, ground), hemisphere)
+    radiance = table.take("radiance", 1.0, Table.numbers)
+    table.known += ["elevation", "azimuth", "direction", "irradiance", "up", "ground"]
+    for key in ("elevation", "azimuth", "direction", "irradiance", "up", "ground"):
+        if table.has(key):
+            raise table.fail(key, table.values[key], "nothing, without cie", "add a line cie = 12, or leave it out")
+    table.done()
+    with table.checked():
+        if image is not None:
+            factor = np.atleast_1d(np.asarray(radiance, float))
+            path = table.source.folder / image
+            if path.suffix.lower() == ".npy":
+                radiance = np.load(path, allow_pickle=False) * (factor if factor.size > 1 else factor[0])
+            else:
+                radiance = read_sky(path) * factor
+        return Sky(radiance, hemisphere)
 
 
 def read_sky(path: str | os.PathLike[str]) -> np.ndarray:
@@ -297,7 +383,7 @@ def _axis(table: Table, key: str, value: Any) -> Any:
 def _side(table: Table, key: str, value: Any) -> Any:
     if isinstance(value, dict):
         wall = Table(value, (*table.path, key), table.source)
-        albedo, emission = wall.take("albedo", 0.5, Table.numbers), wall.take("emission", 0.0, Table.numbers)
+        albedo, emission = wall.take("albedo", 0.5, _albedo_of(None)), wall.take("emission", 0.0, Table.numbers)
         wall.done()
         with wall.checked():
             return Wall(albedo, emission)

@@ -1,6 +1,7 @@
 """Writing a scene and its cameras as a scene file, and the commented example of `raymanifold init`.
 
-Arrays and meshes are written beside the file, under its name: `NAME-scattering.npy`, `NAME-sky0.npy`, `NAME-mesh0.obj`.
+Arrays and meshes are written beside the file, under its name: `NAME-scattering.npy`, `NAME-sky0.npy`, `NAME-mesh0.obj`,
+`NAME-solid0-albedo.npy`.
 
 Public names: `save_scene`, `EXAMPLE`.
 """
@@ -22,6 +23,7 @@ from ..lattice import Lattice
 from ..mesh import Mesh
 from ..scene import Medium, PointLight, Scene, Sky, Sun, Wall
 from ..shapes import Difference, Intersection, Rotated, Shape, Translated, Union
+from ..skies import CieSky
 from ..spectra import Bands
 from ..texture import Texture
 from ..voxels import Voxels
@@ -50,7 +52,7 @@ length_unit = "m"                # km, m, cm, mm, um, in or ft
 [boundary]                       # each side is "open", "mirror", "periodic" or a wall; or [lower, upper]
 x = { albedo = [0.7, 0.2, 0.15] }
 y = [{ albedo = 0.7 }, { albedo = 0.7 }]
-z = [{ albedo = 0.6 }, "open"]
+z = [{ albedo = 0.6 }, "open"]    # or { albedo = { texture = "floor.npy", axis = "z" } }: an array (nx, ny[, bands])
 
 [[solids]]
 shape = "sphere"                 # or box, torus, cylinder, half-space, mesh, voxels
@@ -71,10 +73,11 @@ albedo = 0.8
 # [[solids]]
 # shape = "mesh"                 # needs trimesh: pip install 'raymanifold-jax[mesh]'
 # file = "model.ply"             # OBJ, PLY, STL, GLB, ... beside this file
-# up = "y"                       # of the file
-# fit_lower = [0.2, 0.2, 0.0]    # scale it into this box; or scale = 0.01
+# up = "y"                       # the file's axis that points up, "y" or "z": if it lies on its side, the other
+# fit_lower = [0.2, 0.2, 0.0]    # scale it to fit between these corners, standing on the lower one; or scale = 0.01
 # fit_upper = [1.0, 1.0, 0.8]
-# albedo = 0.6
+# resolution = 256               # finer edges and thin parts (128 along its longest side, if left out)
+# albedo = 0.6                   # or { faces = "colors" }, those of the file; or { faces = "albedo.npy" }, (faces[, bands])
 
 [medium]                         # leave it out for vacuum
 scattering = "0.6 /m"
@@ -85,6 +88,10 @@ absorption = "0.05 /m"
 kind = "sky"
 radiance = [0.35, 0.5, 0.8]      # W m^-2 sr^-1
 # image = "sky.exr"              # latitude-longitude, twice as wide as high; times radiance
+# cie = 12                       # or a CIE standard sky: 1 overcast, 5 even, 12 clear; then radiance is that at the zenith,
+# elevation = 55                 # and the sun's place sets the pattern (1, 3, 5 and 16 need none; the sun's own light is below)
+# azimuth = 200
+# ground = 0.1                   # radiance from below the horizon
 
 [[lights]]
 kind = "sun"
@@ -125,8 +132,8 @@ def save_scene(
 
     `bands`: the wavelengths of the scene's bands; with them `white`, the band values that pictures show as white, D65 if None.
 
-    **Raises** `ValueError` for what a file cannot hold (skies that are functions, shapes of one's own); `FileNotFoundError`
-    if the directory is missing.
+    **Raises** `ValueError` for what a file cannot hold (skies and shapes of one's own); `FileNotFoundError` if the directory is
+    missing.
     """
     checks.instance("scene", scene, Scene, "pass an rm.Scene")
     path = Path(path)
@@ -142,15 +149,17 @@ def save_scene(
         out += _block("[bands]", {"edges": list(bands.edges), "white": shown})
     out += _block("[lattice]", {"shape": list(lattice.shape), "spacing": lattice.spacing, "origin": list(lattice.origin)})
     sides = [
-        {"albedo": _albedo(side.albedo), "emission": _plain(side.emission)}
+        {"albedo": writer.albedo(side.albedo, f"wall-{'xyz'[n // 2]}{n % 2}"), "emission": _plain(side.emission)}
         if isinstance(side, Wall)
         else next(name for name, known in SIDES.items() if known is side)
-        for side in scene.boundary.sides
+        for n, side in enumerate(scene.boundary.sides)
     ]
     out += _block("[boundary]", {axis: sides[2 * i : 2 * i + 2] for i, axis in enumerate("xyz")})
     for number, solid in enumerate(scene.solids):
         rows = writer.shape(solid.shape, f"solids[{number}]")
-        out += _block("[[solids]]", {**rows, "albedo": _albedo(solid.albedo), "emission": _plain(solid.emission)})
+        out += _block(
+            "[[solids]]", {**rows, "albedo": writer.albedo(solid.albedo, f"solid{number}"), "emission": _plain(solid.emission)}
+        )
     if scene.medium is not None:
         out += _block("[medium]", writer.medium(scene.medium))
     for number, light in enumerate(scene.lights):
@@ -213,6 +222,17 @@ class _Writer:
             rows[key] = _plain(value) if value.ndim < 3 else self.array(value, f"{key}.npy")
         return rows
 
+    def albedo(self, value: Any, name: str) -> Any:
+        if not isinstance(value, Texture):
+            return _plain(value)
+        values = np.asarray(value.values)
+        if value.faces is not None:
+            return {"faces": self.array(values[:, 0], f"{name}-albedo.npy")}
+        corners = {
+            key: _plain(corner) for key, corner in (("lower", value.lower), ("upper", value.upper)) if corner is not None
+        }
+        return {"texture": self.array(values, f"{name}-albedo.npy"), "axis": value.axis, **corners}
+
     def array(self, value: np.ndarray, name: str) -> str:
         file = self.beside(name)
         with written_atomically(file) as temporary:
@@ -224,10 +244,15 @@ class _Writer:
             return {"kind": "sun", "direction": _plain(light.direction), "irradiance": _plain(light.irradiance)}
         if isinstance(light, PointLight):
             return {"kind": "point", "position": _plain(light.position), "intensity": _plain(light.intensity)}
+        half = {} if light.hemisphere is None else {"hemisphere": _plain(light.hemisphere)}
+        if isinstance(light.radiance, CieSky):
+            sky = light.radiance
+            sun = {} if sky.sun_direction is None else {"direction": _plain(sky.sun_direction)}
+            rows = {"kind": "sky", "cie": sky.kind, **sun, "radiance": _plain(sky.zenith)}
+            return rows | {"ground": _plain(sky.ground), "up": _plain(sky.up), **half}
         if callable(light.radiance):
             advice = "sample it as a latitude-longitude image first"
             checks.fail(f"lights[{number}].radiance", "a function", "numbers or an image", advice)
-        half = {} if light.hemisphere is None else {"hemisphere": _plain(light.hemisphere)}
         radiance = np.asarray(light.radiance)
         if radiance.ndim < 2:
             return {"kind": "sky", "radiance": _plain(radiance), **half}
@@ -248,12 +273,6 @@ def _camera(name: str, camera: AbstractCamera) -> dict[str, Any]:
     return (
         rows | {"kind": "orthographic"} | {key: _plain(getattr(camera, key)) for key in ("center", "direction", "up", "width")}
     )
-
-
-def _albedo(value: Any) -> Any:
-    if isinstance(value, Texture):
-        checks.fail("albedo", "a texture", "a value or one for each band", "keep textures in Python; Solution.save holds them")
-    return _plain(value)
 
 
 def _plain(value: Any) -> Any:

@@ -83,8 +83,11 @@ class Table:
                 raise self.fail(key, "a name that means nothing here", f"one of {', '.join(dict.fromkeys(self.known))}", advice)
 
     @contextmanager
-    def checked(self) -> Iterator[None]:
-        """Errors of the library, with this table's line, or its key's where the message names one."""
+    def checked(self, **keys: str) -> Iterator[None]:
+        """Errors of the library, with this table's line, or its key's where the message names one.
+
+        `keys`: what the file calls the arguments that errors name, where it calls them otherwise.
+        """
         try:
             yield
         except SceneFileError:
@@ -92,6 +95,9 @@ class Table:
         except (ValueError, TypeError, OSError, ImportError) as error:
             text = str(error)
             named = re.match(r"[A-Za-z_]+", text)
+            if named and named.group() in keys:
+                text = keys[named.group()] + text[named.end() :]
+                named = re.match(r"[A-Za-z_]+", text)
             key = named.group() if named and named.group() in self.values else None
             where = self.source.at(self.path if key is None else (*self.path, key))
             raise SceneFileError(f"{where}: {_name(self.path)}{': ' if self.path else ''}{text}") from error
@@ -161,6 +167,12 @@ class Table:
     def place(self, key: str, value: Any) -> list[float]:
         """Three lengths."""
         return self._triple(key, value, self.length)
+
+    def places(self, key: str, value: Any) -> list[float]:
+        """A list of lengths."""
+        if not isinstance(value, list):
+            raise self.fail(key, value, "a list of lengths", f"write {key} = [0.0, 0.0]")
+        return [self.length(key, v) for v in value]
 
     def angle(self, key: str, value: Any) -> float:
         """In radians; a bare number is in degrees."""
