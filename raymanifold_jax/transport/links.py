@@ -26,6 +26,7 @@ from jaxtyping import Array, Float, Int
 
 from ..layout import AxisReads, Layout, Ordinates, Reads
 from ..memory import LINKS, MOST_LINKS
+from . import native
 from .characteristic import (
     Chords,
     _chunk,
@@ -102,14 +103,11 @@ def find_links(layout: Layout, ordinates: tuple[Ordinates, ...]) -> Links:
     sending, number = np.unique(cell, return_inverse=True)
     numbers = np.zeros(int(np.prod(layout.padded)), np.int32)
     numbers[sending] = np.arange(1, len(sending) + 1)
-    found: dict[tuple[int, int], list] = {}
-    for view in _all_views(layout, ordinates, numbers.reshape(layout.padded)):
-        found.setdefault((view.axis, view.kind), []).append((view.read, view.source, view.weight))
-    rows = []
-    for (axis, kind), parts in found.items():
-        row, source, weight = (np.concatenate(values) for values in zip(*parts, strict=True))
-        if len(row):
-            rows.append(_packed(row, source, weight, layout.reads[axis][kind].element))
+    numbers = numbers.reshape(layout.padded)
+    if native.serves(layout, ordinates, ()):
+        rows = [_Rows(*map(jnp.asarray, seen)) for seen in native.views(layout, ordinates, numbers)]
+    else:
+        rows = _swept_rows(layout, ordinates, numbers)
     return Links(
         rows=tuple(rows),
         element=layout.source_element,
@@ -118,6 +116,18 @@ def find_links(layout: Layout, ordinates: tuple[Ordinates, ...]) -> Links:
         numbers=len(sending) + 1,
         elements=layout.elements,
     )
+
+
+def _swept_rows(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: Int[np.ndarray, "X Y Z"]) -> list[_Rows]:
+    found: dict[tuple[int, int], list] = {}
+    for view in _all_views(layout, ordinates, numbers):
+        found.setdefault((view.axis, view.kind), []).append((view.read, view.source, view.weight))
+    rows = []
+    for (axis, kind), parts in found.items():
+        row, source, weight = (np.concatenate(values) for values in zip(*parts, strict=True))
+        if len(row):
+            rows.append(_packed(row, source, weight, layout.reads[axis][kind].element))
+    return rows
 
 
 def _packed(row: np.ndarray, source: np.ndarray, weight: np.ndarray, element: Array) -> _Rows:

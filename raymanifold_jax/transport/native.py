@@ -6,7 +6,7 @@ directions and extinction are. Each core takes some of the directions through al
 This serves known numbers of one device that is a CPU, where numba is installed; all else is left to `characteristic`, which
 gives the same results to rounding.
 
-Public: `serves`, `sweep`, `unsweep`.
+Public: `serves`, `sweep`, `unsweep`, `views`, `Seen`.
 """
 
 from __future__ import annotations
@@ -188,12 +188,56 @@ def unsweep(
     return jnp.asarray(exitance, real), source, tuple(map(jnp.asarray, fields[1:])) if sloped else None
 
 
+class Seen(NamedTuple):
+    """What the elements of some reads see: numbers of voxels that send, and their weights; padded with weight 0."""
+
+    source: np.ndarray  # [S, M]
+    weight: np.ndarray
+    element: np.ndarray  # [M]
+
+
+def views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray) -> list[Seen]:
+    """In vacuum, what elements see: of voxels that send the `numbers`, 1 and up, [X, Y, Z]."""
+    from . import machine_code as code
+    from .derivative import Manner
+
+    real, found = np.dtype(layout.plane.dtype), []
+
+    def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
+        planes, cut, *readers = arguments
+        codes = numbers.transpose(AXES[axis]).reshape(-1).astype(np.int32)
+        listed = _frozen(tuple(codes[_flat(cells, line.area)] for cells in (cut, line.ghosts)))
+
+        def run(part: np.ndarray):
+            lists = lambda most: tuple((np.zeros((len(r.cell), s), np.int32), np.zeros((len(r.cell), s), real))
+                                       for r, s in zip(readers, most, strict=True))  # fmt: skip
+            most = (0, 0)
+            for _ in range(2):  # how long the lists must be, and what is in them
+                seen, filled = [np.zeros(len(r.cell), int) for r in readers], lists(most)
+                work = _work(code, line, min(how.rows, len(part)), np.dtype(np.int32))
+                of_each = ((s, *f) for s, f in zip(seen, filled, strict=True))
+                code.views(part, line.ways, planes, cut, line.ghosts, *readers, how, work, *listed, *of_each)
+                most = tuple(int(s.max(initial=0)) for s in seen)
+            return filled
+
+        of_parts = list(on_cores(run, line.parts))
+        for kind, of_kind in enumerate(readers):
+            source, weight = (np.concatenate([filled[kind][i] for filled in of_parts], axis=1) for i in (0, 1))
+            used = weight.any(axis=1)
+            element = np.asarray(of_kind.element)[used]
+            found.append(Seen(np.ascontiguousarray(source[used].T), np.ascontiguousarray(weight[used].T), element))
+
+    for line in _lines(Manner(False), layout, ordinates, None, 1, False, real):
+        along(*line)
+    return [seen for seen in found if seen.weight.size]
+
+
 def _lines(manner: Any, layout: Layout, ordinates, extinction, bands: int, sloped: bool, real: np.dtype) -> Iterator[tuple]:
     """Each axis: its number, what is listed along it, and the arguments of `machine_code`."""
     from . import machine_code as code
 
     for axis, own in enumerate(ordinates):
-        if own.weight.shape[0]:
+        if own.weight.shape[0] and int(own.chunks):
             line = _axis(layout, own, axis)
             medium = _medium(layout, line, axis, extinction, bands, real)
             arguments = _arguments(code, layout, line, medium, axis)

@@ -11,7 +11,7 @@ from .voxels_back import back_cut, back_free, back_ghosts, give_cut, keep_cut
 
 
 @register_jitable
-def _most_laps(ways, batch):
+def most_laps(ways, batch):
     laps = 1
     for n in batch:
         laps = max(laps, ways.laps[n])
@@ -19,7 +19,7 @@ def _most_laps(ways, batch):
 
 
 @compiled
-def _begin(work):
+def begin_batch(work):
     rows, most = work.rows, len(work.own)
     for b in range(len(rows)):
         for i in range(rows.shape[1]):
@@ -39,9 +39,9 @@ def forwards(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wor
     most = len(own)
     for first in range(0, len(chosen), most):
         batch = chosen[first : first + most]
-        laps = _most_laps(ways, batch)
+        laps = most_laps(ways, batch)
         for c in range(bands):
-            _begin(work)
+            begin_batch(work)
             for when in range(-(laps - 1) * count, count):
                 reading = when >= 0
                 # Batches may hold both senses: those of one sense go together.
@@ -101,9 +101,9 @@ def backwards(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_
     asked, most = work.asked, len(own)
     for first in range(0, len(chosen), most):
         batch = chosen[first : first + most]
-        laps = _most_laps(ways, batch)
+        laps = most_laps(ways, batch)
         for c in range(bands):
-            _begin(work)
+            begin_batch(work)
             for when in range(count - 1, -(laps - 1) * count - 1, -1):
                 reading = when >= 0
                 for sense in (1, -1):

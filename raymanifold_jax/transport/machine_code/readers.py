@@ -29,7 +29,7 @@ def tilt(faces, r, a, u, v):
 
 
 @register_jitable
-def _marked(bits, n, m):
+def marked(bits, n, m):
     return (bits[n, m >> 3] >> np.uint8(m & 7)) & np.uint8(1)
 
 
@@ -113,7 +113,7 @@ def _form_of_paths(readers, r, extinction, count, way, length, spacing, cells, m
 
 
 @register_jitable
-def _form(paths, readers, r, extinction, count, way, length, spacing, cells, manner, form):
+def form_of(paths, readers, r, extinction, count, way, length, spacing, cells, manner, form):
     if paths:
         return _form_of_paths(readers, r, extinction, count, way, length, spacing, cells, manner, form)
     return _form_of_hits(readers, r, extinction, count, way, length, manner, form)
@@ -138,13 +138,13 @@ def _read_one(c, k, m, j, cell, count, form, rows, way, margin, light, manner, s
 def _add_term(sums, bits, n, cell, first, last, factor, values):
     """Without a branch: a processor cannot guess the marks."""
     for m in range(first, last):
-        sums[m] += factor * _marked(bits, n, m) * values[cell[m]]
+        sums[m] += factor * marked(bits, n, m) * values[cell[m]]
 
 
 @compiled
 def _ask_term(values, bits, n, cell, first, last, factor, wanted):
     for m in range(first, last):
-        values[cell[m]] += factor * _marked(bits, n, m) * wanted[m]
+        values[cell[m]] += factor * marked(bits, n, m) * wanted[m]
 
 
 @compiled
@@ -159,9 +159,9 @@ def read(paths, readers, ways, n, k, c, count, way, length, rows, margin, light,
         first, last = readers.first[r], readers.first[r + 1]
         if not manner.medium or (readers.even[c, r] and last > first + 1):
             depth = readers.depth[c, r] if manner.medium else 0.0
-            if last == first + 1 and not _marked(bits, n, first):
+            if last == first + 1 and not marked(bits, n, first):
                 continue
-            if not _form(paths, readers, r, depth, count, way, length, spacing, cells, manner, form):
+            if not form_of(paths, readers, r, depth, count, way, length, spacing, cells, manner, form):
                 continue
             scaled(form, -along * ways.weight[n])
             if last == first + 1:
@@ -179,9 +179,9 @@ def read(paths, readers, ways, n, k, c, count, way, length, rows, margin, light,
                     _add_term(of_band, bits, n, cell, first, last, form[4 + d], light.slopes[d][k, c])
             continue
         for m in range(first, last):
-            if not _marked(bits, n, m):
+            if not marked(bits, n, m):
                 continue
-            if not _form(paths, readers, r, readers.extinction[c, m], count, way, length, spacing, cells, manner, form):
+            if not form_of(paths, readers, r, readers.extinction[c, m], count, way, length, spacing, cells, manner, form):
                 continue
             scaled(form, -along * ways.weight[n])
             _read_one(c, k, m, readers.cut[r], cell[m], count, form, rows, way, margin, light, manner, sums)
@@ -218,9 +218,9 @@ def ask(paths, readers, ways, n, k, c, count, way, length, asked, back, here, ce
         first, last, j = readers.first[r], readers.first[r + 1], readers.cut[r]
         if not manner.medium or (readers.even[c, r] and last > first + 1):
             depth = readers.depth[c, r] if manner.medium else 0.0
-            if last == first + 1 and not _marked(bits, n, first):
+            if last == first + 1 and not marked(bits, n, first):
                 continue
-            if not _form(paths, readers, r, depth, count, way, length, spacing, cells, manner, form):
+            if not form_of(paths, readers, r, depth, count, way, length, spacing, cells, manner, form):
                 continue
             scaled(form, -along * ways.weight[n])
             if last == first + 1:
@@ -237,9 +237,9 @@ def ask(paths, readers, ways, n, k, c, count, way, length, asked, back, here, ce
                     _ask_term(back.slopes[d][k, c], bits, n, cell, first, last, form[4 + d], of_band)
             continue
         for m in range(first, last):
-            if not _marked(bits, n, m):
+            if not marked(bits, n, m):
                 continue
-            if not _form(paths, readers, r, readers.extinction[c, m], count, way, length, spacing, cells, manner, form):
+            if not form_of(paths, readers, r, readers.extinction[c, m], count, way, length, spacing, cells, manner, form):
                 continue
             scaled(form, -along * ways.weight[n])
             _ask_one(c, k, m, paths, j, cell[m], count, form, asked, begun, here, back, manner, wanted)
