@@ -1,8 +1,9 @@
 """The faces that surfaces have in voxels: which there are, their planes, and their areas.
 
-A surface that is smooth in a voxel has one face there: the plane through the middle of its patch. Past a crease there is one for
-each side of it. In voxels, from the voxel's centre c, a face is the plane n . (x - c) + offset = 0. Samples of the voxel, moved
-to the surface by x <- x - f(x) grad f(x), tell how many normals it has; points on the planes tell how much of them is surface.
+A surface that is smooth in a voxel has one face there: the plane through the middle of its patch. Past a crease there is one
+for each side of it. In voxels, from the voxel's centre c, a face is the plane n . (x - c) + offset = 0. Samples of the voxel,
+moved to the surface by x <- x - f(x) grad f(x), tell how many normals it has; points on the planes tell how much of them is
+surface.
 
 Distances and slopes are what takes time. They are evaluated many points at once, of the points that count, by one program each.
 
@@ -18,7 +19,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from .lattice import Lattice
 from .shapes import Shape, dot, greatest, least
@@ -31,9 +33,11 @@ _FACES = 6  # faces told apart in a voxel, at most
 #: Points this far behind a face (voxels) decide which voxel owns it: the one on the solid side.
 _INWARD = 1e-3
 _PATCH = 8  # samples a side on an element's plane
+_AT_SURFACE = 0.02  # voxels: points that were moved to the surface are on it
 _SLIVER = 0.1  # voxel faces: patches smaller than this
 _POINTS = 1 << 16  # evaluated at once: one size, for one compilation, whose arrays fit a cache
-_VOXELS = _POINTS // 64  # voxels with as many samples, and planes with as many points on each of their grids
+_VOXELS = _POINTS // 64  # voxels with as many samples
+_PLANES = 960  # planes with a few less in their voxels: on average each has 64
 _STEPS = np.linspace(-0.9, 0.9, 37)  # voxels: where a face is looked for along its normal
 
 
@@ -93,10 +97,18 @@ def _least(shapes: tuple, points: Array) -> Array:
 
 @eqx.filter_jit
 def _slope(shapes: tuple, points: Array) -> tuple[Array, Array]:
+    # One by one, so that XLA does not work each out anew wherever their least is asked for.
+    parts = [lax.optimization_barrier(_slope_of(shape, points)) for shape in shapes]
+    values = tuple(value for value, _ in parts)
+    along = [jax.jvp(least, (values,), (tuple(rates[axis] for _, rates in parts),))[1] for axis in range(3)]
+    return least(values), jnp.stack(along, -1)
+
+
+def _slope_of(shape: Shape, points: Array) -> tuple[Array, list[Array]]:
     # Forwards along each coordinate: quicker here than backwards.
-    rates = [jnp.broadcast_to(jnp.eye(3, dtype=points.dtype)[axis], points.shape) for axis in range(3)]
-    (value, x), (_, y), (_, z) = (jax.jvp(lambda at: _union(shapes, at), (points,), (rate,)) for rate in rates)
-    return value, jnp.stack([x, y, z], -1)
+    axes = [jnp.broadcast_to(jnp.eye(3, dtype=points.dtype)[axis], points.shape) for axis in range(3)]
+    found = [jax.jvp(shape.distance, (points,), (axis,)) for axis in axes]
+    return found[0][0], [rate for _, rate in found]
 
 
 @eqx.filter_jit
@@ -105,7 +117,7 @@ def _nearest(shapes: tuple, points: Array) -> Array:
 
 
 def find_faces(field: DistanceField, voxels: Int[np.ndarray, "V 3"]) -> dict[str, np.ndarray]:
-    """Rows `voxel`, `normal`, `offset`, `area` (voxels squared), `centroid` (voxels, from the voxel's centre) of their faces."""
+    """Rows `voxel`, `normal`, `offset`, `area` (voxels squared), `centroid` (voxels, from the voxel's centre) of faces."""
     spacing = field.spacing
     center = field.lattice.lower + (voxels + 0.5) * spacing
     normals, has_face = _distinct_normals(field, center)
@@ -123,7 +135,7 @@ def find_faces(field: DistanceField, voxels: Int[np.ndarray, "V 3"]) -> dict[str
     offset[creased] = _plane_offset(field, center[rows[creased]], normal[creased])
     met = np.isfinite(offset)
     planes = center[rows[met]], normal[met], offset[met], creased[met]
-    parts = [_patches(field, *(p[i : i + _VOXELS] for p in planes)) for i in range(0, max(met.sum(), 1), _VOXELS)]
+    parts = [_patches(field, *(p[i : i + _PLANES] for p in planes)) for i in range(0, max(met.sum(), 1), _PLANES)]
     found = {"voxel": voxels[rows[met]]} | {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     keep = found.pop("keep")
     return {key: value[keep] for key, value in found.items()}
@@ -190,7 +202,7 @@ def _is_near(center: Array, points: Array, value: Array, spacing: float) -> Arra
     apart = jnp.abs(points.reshape(len(center), -1, 3) - center[:, None]) / spacing
     # A face is owned by a point that is inwards of it.
     return (greatest(tuple(apart[..., axis] for axis in range(3))) <= 0.5 + 1.1 * _INWARD).ravel() & (
-        jnp.abs(value / spacing) < 0.02
+        jnp.abs(value / spacing) < _AT_SURFACE
     )
 
 
@@ -276,17 +288,19 @@ def _along_normals(center: Array, normal: Array, spacing: float) -> Array:
 def _patches(
     field: DistanceField, center: np.ndarray, normal: np.ndarray, offset: np.ndarray, creased: np.ndarray
 ) -> dict[str, np.ndarray]:
-    """What there is of the faces on at most `_VOXELS` planes: moved to the middle of their patches where not `creased`."""
+    """What there is of the faces on at most `_PLANES` planes: moved to the middle of their patches where not `creased`."""
     spacing, count = field.spacing, len(center)
     here = lambda a: np.asarray(a)[:count]
-    at = lambda points: tuple(zip(*map(field.raw_gradient, points), strict=True))
-    centers, normals, offsets, creases = (_padded(a, _VOXELS) for a in (center, normal, offset, creased))
+    centers, normals, offsets, creases = (_padded(a, _PLANES) for a in (center, normal, offset, creased))
     # Planes through the middle of their patch: the tangent at the point nearest the centre would stand proud of a ball.
     points, patch, weight = _on_planes(centers, normals, offsets, spacing)
-    normals, offsets = _refitted(normals, offsets, creases, patch, weight, *at(points), spacing)
+    light = _Readings(field, points)
+    light.add(np.asarray(weight > 0) & ~creases[:, None])
+    normals, offsets = _refitted(normals, offsets, creases, patch, weight, light.value, light.slope)
     points, patch, weight = _on_planes(centers, normals, offsets, spacing)
-    values, slopes = at(points)
-    covered, whole, middle, curved = map(here, _measured(normals, creases, patch, weight, values, slopes, spacing))
+    light = _Readings(field, points)
+    light.add(np.asarray(weight > 0))
+    covered, whole, middle, curved = map(here, _measured(normals, creases, patch, weight, light.value, light.slope))
     normal, offset = here(normals), here(offsets)
     area = plane_area_in_voxel(normal, offset)
     # Corners that a smooth surface cuts off may be too small for the grid of points.
@@ -297,8 +311,13 @@ def _patches(
     area = area * covered / np.maximum(whole, 1e-9)
     curved = curved & ~sliver
     if curved.any():
-        points, patch = _moved(centers, patch, values, slopes, spacing)
-        area = np.where(curved, here(_curved_area(normals, patch, *at(points), spacing)), area)
+        wanted = np.zeros(weight.shape, bool)
+        wanted[:count][curved] = True
+        light.add(wanted & np.asarray(weight == 0))
+        points, patch = _moved(centers, patch, light.value, light.slope, spacing)
+        light = _Readings(field, points)
+        light.add(wanted, _AT_SURFACE)
+        area = np.where(curved, here(_curved_area(normals, patch, light.value, light.slope)), area)
     half_width = 0.5 * np.abs(normal).sum(1)
     owned = (offset < half_width - 1e-6) & (offset >= -half_width - 1e-6)
     keep = owned & (covered > np.where(sliver, 0.0, 0.02)) & (area > 1e-3)
@@ -325,30 +344,34 @@ def patch_points(normal: Any, offset: Any, count: int = _PATCH, xp: Any = np) ->
     return xp.concatenate(points, 1), xp.concatenate(weights, 1)
 
 
-# Steps of `_patches`: arrays of a patch's points (M, 3 n^2[, 3]), evaluated as those of three grids, (M n^2[, 3]) each.
-Grids = tuple[Array, ...]
+class _Readings:
+    """The signed distance and its slope at points (M, S, 3), as far as they were asked for."""
+
+    def __init__(self, field: DistanceField, points: Array):
+        self._field, self._points = field, np.asarray(points)
+        self.value, self.slope = np.full(points.shape[:-1], np.inf), np.zeros(points.shape)
+
+    def add(self, chosen: Bool[np.ndarray, "M S"], within: float | None = None) -> None:
+        """Read these points; the slopes of those `within` so many voxels of a surface, if given."""
+        if within is not None:
+            self.value[chosen] = self._field.distance(self._points[chosen])
+            chosen = np.abs(self.value) < within
+        self.value[chosen], self.slope[chosen] = self._field.gradient(self._points[chosen])
 
 
-def _split(points: Array, center: Array, spacing: float) -> Grids:
-    """Points of patches, in scene units, by grid."""
-    points = (center[:, None] + points * spacing).reshape(len(center), 3, -1, 3)
-    return tuple(points[:, axis].reshape(-1, 3) for axis in range(3))
-
-
-def _joined(grids: Grids, rows: int) -> Array:
-    return jnp.concatenate([g.reshape(rows, -1, *g.shape[1:]) for g in grids], 1)
+# Steps of `_patches`, which have the points of each plane's patch in a row.
 
 
 @jax.jit
-def _on_planes(center: Array, normal: Array, offset: Array, spacing: float) -> tuple[Grids, Array, Array]:
+def _on_planes(center: Array, normal: Array, offset: Array, spacing: float) -> tuple[Array, Array, Array]:
     patch, weight = patch_points(normal, offset, xp=jnp)
-    return _split(patch, center, spacing), patch, weight
+    return center[:, None] + patch * spacing, patch, weight
 
 
 @jax.jit
-def _refitted(normal, offset, creased, patch: Array, weight: Array, values: Grids, slopes: Grids, spacing: float):
+def _refitted(normal, offset, creased, patch: Array, weight: Array, value: Array, slope: Array):
     """Planes moved so that over their patches in the voxel the signed distance averages 0 and its slope is theirs."""
-    value, slope = _joined(values, len(normal)) / spacing, _joined(slopes, len(normal))
+    value = jnp.where(weight > 0, value, 0.0)
     weight = weight * (dot(slope, normal[:, None]) > 0.7)  # not past an edge
     area = weight.sum(1)
     share = weight / jnp.maximum(area, 1e-9)[:, None]
@@ -361,9 +384,9 @@ def _refitted(normal, offset, creased, patch: Array, weight: Array, values: Grid
 
 
 @jax.jit
-def _measured(normal, creased, patch: Array, weight: Array, values: Grids, slopes: Grids, spacing: float) -> Grids:
+def _measured(normal, creased, patch: Array, weight: Array, value: Array, slope: Array) -> tuple[Array, ...]:
     """How much of the planes in the voxel is surface, and is there of them; its middle; and whether the surface is curved."""
-    error, slope = _joined(values, len(normal)) / spacing, _joined(slopes, len(normal))
+    error = jnp.where(weight > 0, value, 0.0)
     # The plane is the face as far as the distance's slope is its normal: past an edge it is not.
     there = (jnp.abs(error) < jnp.where(creased, 0.1, 0.5)[:, None]) & (dot(slope, normal[:, None]) > 0.7)
     real = weight * there
@@ -377,14 +400,13 @@ def _mean(vectors: Array, share: Array) -> Array:
 
 
 @jax.jit
-def _moved(center, patch: Array, values: Grids, slopes: Grids, spacing: float) -> tuple[Grids, Array]:
+def _moved(center, patch: Array, value: Array, slope: Array, spacing: float) -> tuple[Array, Array]:
     """Points on planes moved to the surface along their grid's axis."""
-    distance, slope = _joined(values, len(center)) / spacing, _joined(slopes, len(center))
     grid = _grid_axes(patch)
     along = dot(slope, grid)
-    move = distance / (jnp.where(along >= 0, 1, -1) * jnp.maximum(jnp.abs(along), 1e-6))
+    move = value / (jnp.where(along >= 0, 1, -1) * jnp.maximum(jnp.abs(along), 1e-6))
     patch = patch - jnp.clip(move, -0.5, 0.5)[..., None] * grid
-    return _split(patch, center, spacing), patch
+    return center[:, None] + patch * spacing, patch
 
 
 def _grid_axes(patch: Array) -> np.ndarray:
@@ -393,20 +415,19 @@ def _grid_axes(patch: Array) -> np.ndarray:
 
 
 @jax.jit
-def _curved_area(normal, patch: Array, values: Grids, slopes: Grids, spacing: float) -> Array:
+def _curved_area(normal, patch: Array, value: Array, slope: Array) -> Array:
     """The area of curved surfaces in their voxels, from points on planes near them that were `_moved` to them.
 
     They stand for the area that the surface's slope there gives them. The planes alone would lack 0.3 % of the area of a ball 7
     voxels in radius, and 3 % of a torus whose tube is 3 voxels thick.
     """
-    distance, slope = _joined(values, len(normal)) / spacing, _joined(slopes, len(normal))
     grid, count = _grid_axes(patch), patch.shape[1] // 3
     size = jnp.abs(dot(slope, grid))
     # The part of a point's cell, over which the surface rises as it slopes there, that is in the voxel.
     rise = (dot(jnp.abs(slope), jnp.ones(3)) - size) / jnp.maximum(size, 1e-6) / np.sqrt(count)
     below = 0.5 - jnp.abs(dot(patch, grid))
     inside = jnp.clip(0.5 + (below + 1e-6) / jnp.maximum(rise, 1e-6), 0.0, 1.0)
-    same = (jnp.abs(distance) < 0.02) & (dot(slope, normal[:, None]) > 0.7)
+    same = (jnp.abs(value) < _AT_SURFACE) & (dot(slope, normal[:, None]) > 0.7)
     return jnp.where(same, inside * size, 0.0).sum(1) / count
 
 

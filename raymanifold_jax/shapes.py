@@ -51,10 +51,14 @@ def least(values: tuple[Float[jax.Array, "*batch"], ...]) -> Float[jax.Array, "*
 @least.defjvp
 def _(primals, tangents):
     (values,), (rates,) = primals, tangents
-    found = functools.reduce(jnp.minimum, values)
-    shares = [(value == found).astype(found.dtype) for value in values]
-    rate = functools.reduce(operator.add, (share * rate for share, rate in zip(shares, rates, strict=True)))
-    return found, rate / functools.reduce(operator.add, shares)
+    found, total, count = values[0], rates[0], jnp.ones_like(values[0])
+    # Each against the least so far, not against the least of all: that one may be rounded another way where XLA repeats it.
+    for value, rate in zip(values[1:], rates[1:], strict=True):
+        lower, upper = value < found, value > found
+        total = jnp.where(lower, rate, jnp.where(upper, total, total + rate))
+        count = jnp.where(lower, 1.0, jnp.where(upper, count, count + 1.0))
+        found = jnp.minimum(found, value)
+    return found, total / count
 
 
 def greatest(values: tuple[Float[jax.Array, "*batch"], ...]) -> Float[jax.Array, "*batch"]:
