@@ -34,6 +34,7 @@ _FACES = 6  # faces told apart in a voxel, at most
 _INWARD = 1e-3
 _PATCH = 8  # samples a side on an element's plane
 _AT_SURFACE = 0.02  # voxels: points that were moved to the surface are on it
+_CURVED = 1e-6  # voxels: surfaces further from their planes than this
 _SLIVER = 0.1  # voxel faces: patches smaller than this
 _POINTS = 1 << 16  # evaluated at once: one size, for one compilation, whose arrays fit a cache
 _VOXELS = _POINTS // 64  # voxels with as many samples
@@ -294,13 +295,15 @@ def _patches(
     centers, normals, offsets, creases = (_padded(a, _PLANES) for a in (center, normal, offset, creased))
     # Planes through the middle of their patch: the tangent at the point nearest the centre would stand proud of a ball.
     points, patch, weight = _on_planes(centers, normals, offsets, spacing)
-    light = _Readings(field, points)
-    light.add(np.asarray(weight > 0) & ~creases[:, None])
-    normals, offsets = _refitted(normals, offsets, creases, patch, weight, light.value, light.slope)
+    read = _Readings(field, points)
+    read.add(np.asarray(weight) > 0)
+    off = np.abs(read.value).max(1) > _CURVED
+    normals, offsets = _refitted(normals, offsets, creases, patch, weight, read.value, read.slope)
     points, patch, weight = _on_planes(centers, normals, offsets, spacing)
-    light = _Readings(field, points)
-    light.add(np.asarray(weight > 0))
-    covered, whole, middle, curved = map(here, _measured(normals, creases, patch, weight, light.value, light.slope))
+    counts = np.asarray(weight) > 0
+    read = _Readings(field, points)
+    read.add(counts | off[:, None])  # the rest of their points will be wanted too, most likely
+    covered, whole, middle, curved = map(here, _measured(normals, creases, patch, weight, read.value, read.slope))
     normal, offset = here(normals), here(offsets)
     area = plane_area_in_voxel(normal, offset)
     # Corners that a smooth surface cuts off may be too small for the grid of points.
@@ -311,13 +314,14 @@ def _patches(
     area = area * covered / np.maximum(whole, 1e-9)
     curved = curved & ~sliver
     if curved.any():
-        wanted = np.zeros(weight.shape, bool)
+        wanted = np.zeros(counts.shape, bool)
         wanted[:count][curved] = True
-        light.add(wanted & np.asarray(weight == 0))
-        points, patch = _moved(centers, patch, light.value, light.slope, spacing)
-        light = _Readings(field, points)
-        light.add(wanted, _AT_SURFACE)
-        area = np.where(curved, here(_curved_area(normals, patch, light.value, light.slope)), area)
+        if (missing := wanted & ~counts & ~off[:, None]).any():
+            read.add(missing)
+        points, patch = _moved(centers, patch, read.value, read.slope, spacing)
+        read = _Readings(field, points)
+        read.add(wanted | (curved.mean() > 0.8))
+        area = np.where(curved, here(_curved_area(normals, patch, read.value, read.slope)), area)
     half_width = 0.5 * np.abs(normal).sum(1)
     owned = (offset < half_width - 1e-6) & (offset >= -half_width - 1e-6)
     keep = owned & (covered > np.where(sliver, 0.0, 0.02)) & (area > 1e-3)
@@ -349,14 +353,16 @@ class _Readings:
 
     def __init__(self, field: DistanceField, points: Array):
         self._field, self._points = field, np.asarray(points)
-        self.value, self.slope = np.full(points.shape[:-1], np.inf), np.zeros(points.shape)
+        self.value, self.slope = np.zeros(points.shape[:-1]), np.zeros(points.shape)
 
-    def add(self, chosen: Bool[np.ndarray, "M S"], within: float | None = None) -> None:
-        """Read these points; the slopes of those `within` so many voxels of a surface, if given."""
-        if within is not None:
-            self.value[chosen] = self._field.distance(self._points[chosen])
-            chosen = np.abs(self.value) < within
-        self.value[chosen], self.slope[chosen] = self._field.gradient(self._points[chosen])
+    def add(self, chosen: Bool[np.ndarray, "M S"]) -> None:
+        """Read these points."""
+        if chosen.all():
+            self.value, self.slope = self._field.gradient(self._points)
+            return
+        where = np.flatnonzero(chosen)
+        found = self._field.gradient(np.take(self._points.reshape(-1, 3), where, axis=0))
+        self.value.reshape(-1)[where], self.slope.reshape(-1, 3)[where] = found
 
 
 # Steps of `_patches`, which have the points of each plane's patch in a row.
@@ -391,7 +397,7 @@ def _measured(normal, creased, patch: Array, weight: Array, value: Array, slope:
     there = (jnp.abs(error) < jnp.where(creased, 0.1, 0.5)[:, None]) & (dot(slope, normal[:, None]) > 0.7)
     real = weight * there
     covered = real.sum(1)
-    curved = (jnp.abs(error) * real).max(1) > 1e-6
+    curved = (jnp.abs(error) * real).max(1) > _CURVED
     return covered, weight.sum(1), _mean(patch, real) / jnp.maximum(covered, 1e-9)[:, None], curved
 
 
