@@ -12,7 +12,9 @@ Public for this package: `DistanceField`, `find_faces`, `patch_points`, `NEAR`.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import equinox as eqx
@@ -84,6 +86,24 @@ def _padded(rows: np.ndarray, size: int) -> np.ndarray:
     return np.concatenate([rows, np.broadcast_to(last, (size - len(rows), *rows.shape[1:]))])
 
 
+def _in_blocks(function: Callable, rows: tuple[np.ndarray, ...], size: int) -> list[Any]:
+    """function(*block) for blocks of rows, some at once: the host works on one while a program runs for another."""
+    blocks = [tuple(a[i : i + size] for a in rows) for i in range(0, max(len(rows[0]), 1), size)]
+    device = jax.config.jax_default_device  # contexts hold for one thread only
+
+    def run(block: tuple[np.ndarray, ...]) -> Any:
+        with jax.enable_x64(True), jax.default_device(device):
+            return function(*block)
+
+    # The first one alone, for its programs to be compiled once.
+    return [run(blocks[0]), *_pool().map(run, blocks[1:])] if len(blocks) > 2 else [*map(run, blocks)]
+
+
+@functools.cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(2, "surfaces")
+
+
 # Programs that scenes of like shapes share.
 
 
@@ -136,7 +156,7 @@ def find_faces(field: DistanceField, voxels: Int[np.ndarray, "V 3"]) -> dict[str
     offset[creased] = _plane_offset(field, center[rows[creased]], normal[creased])
     met = np.isfinite(offset)
     planes = center[rows[met]], normal[met], offset[met], creased[met]
-    parts = [_patches(field, *(p[i : i + _PLANES] for p in planes)) for i in range(0, max(met.sum(), 1), _PLANES)]
+    parts = _in_blocks(lambda *block: _patches(field, *block), planes, _PLANES)
     found = {"voxel": voxels[rows[met]]} | {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     keep = found.pop("keep")
     return {key: value[keep] for key, value in found.items()}
@@ -144,16 +164,19 @@ def find_faces(field: DistanceField, voxels: Int[np.ndarray, "V 3"]) -> dict[str
 
 def _distinct_normals(field: DistanceField, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distinct surface normals in each voxel: (V, faces, 3) and which of them exist (V, faces)."""
-    spacing, parts = field.spacing, []
-    for i in range(0, len(center), _VOXELS):
-        block = center[i : i + _VOXELS]
-        points = slope = _samples(_padded(block, _VOXELS), spacing)
+    spacing, index = field.spacing, np.arange(len(center))
+
+    def near_samples(block: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        centers = _padded(block, _VOXELS)
+        points = slope = _samples(centers, spacing)
         for _ in range(2):  # project the samples on the surface
             value, slope = field.raw_gradient(points)
             points = _projected(points, value, slope)
-        near = _is_near(_padded(block, _VOXELS), points, field.raw_distance(points), spacing)
+        near = _is_near(centers, points, field.raw_distance(points), spacing)
         (chosen,) = np.nonzero(np.asarray(near)[: 64 * len(block)])
-        parts.append((chosen + 64 * i, np.asarray(points)[chosen], np.asarray(slope)[chosen]))
+        return 64 * index[chosen // 64] + chosen % 64, np.asarray(points)[chosen], np.asarray(slope)[chosen]
+
+    parts = _in_blocks(near_samples, (center, index), _VOXELS)
     number, points, outward = (np.concatenate(part) for part in zip(*parts, strict=True))
     slope, clear = _slopes(field, points, outward)
     behind = (points - center[number // 64]) / spacing - _INWARD * slope

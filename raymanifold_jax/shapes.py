@@ -33,12 +33,15 @@ from . import checks
 Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
 
 
-# What follows works coordinate by coordinate: sums and extrema along an axis of three numbers are loops that XLA does not
-# vectorise, and cost five times as much.
+#: Numbers: where there are more, sums and extrema along an axis of three are taken coordinate by coordinate. XLA does not
+#: vectorise their loops (five times as long); where there are few, the number of its operations counts.
+_MANY = 1 << 14
 
 
 def dot(one: Float[jax.Array, "*batch n"], other: Float[jax.Array, "*batch n"]) -> Float[jax.Array, "*batch"]:
     """Scalar product along the last axis."""
+    if one.size < _MANY:
+        return jnp.sum(one * other, axis=-1)
     return functools.reduce(operator.add, (one[..., i] * other[..., i] for i in range(one.shape[-1])))
 
 
@@ -374,6 +377,6 @@ def _across(axis: Any) -> np.ndarray:
 
 def corner_distance(excess: jax.Array) -> jax.Array:
     # Distance to a convex corner of planes, from how far the point is beyond each plane.
-    inside = greatest(tuple(excess[..., i] for i in range(excess.shape[-1])))
+    inside = jnp.max(excess, axis=-1) if excess.size < _MANY else greatest(tuple(jnp.moveaxis(excess, -1, 0)))
     # Not the usual sum of an outside and an inside term: on a face that would halve the gradient.
     return jnp.where(inside > 0, safe_norm(jnp.maximum(excess, 0)), inside)
