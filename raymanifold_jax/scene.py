@@ -26,7 +26,7 @@ from jaxtyping import Float, Int
 
 from . import checks
 from .lattice import Lattice
-from .shapes import Shape, safe_norm
+from .shapes import Shape, least, safe_norm
 from .texture import Texture
 
 
@@ -322,17 +322,14 @@ class Scene(eqx.Module):
         points = checks.coordinates("points", points)
         if not self.solids:
             return jnp.full(points.shape[:-1], 1e9 * self.lattice.spacing, points.dtype)
-        return jnp.min(self._distances(points), axis=0)
+        return least(tuple(solid.shape.distance(points) for solid in self.solids))
 
     def solid_at(self, points: Float[Any, "*batch 3"]) -> Int[jax.Array, "*batch"]:
         """Index into `solids` of the one nearest to (or deepest around) each of `points` (..., 3); -1 if none."""
         points = checks.coordinates("points", points)
         if not self.solids:
             return jnp.full(points.shape[:-1], -1)
-        return jnp.argmin(self._distances(points), axis=0)
-
-    def _distances(self, points: jax.Array) -> jax.Array:
-        return jnp.stack([solid.shape.distance(points) for solid in self.solids])
+        return jnp.argmin(jnp.stack([solid.shape.distance(points) for solid in self.solids]), axis=0)
 
     def summary(self) -> str:
         """The scene in one line."""

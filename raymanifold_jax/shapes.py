@@ -14,11 +14,12 @@ computes in the dtype of its points, and has a finite gradient everywhere (of le
 is unique and shorter, down to 0, where it is not: at a sphere's centre, on an edge).
 
 Public names: `Shape`, `Sphere`, `Box`, `Torus`, `Cylinder`, `HalfSpace`, `Union`, `Intersection`, `Difference`,
-`Translated`, `Rotated`; `safe_norm`, `corner_distance` for this package.
+`Translated`, `Rotated`; `safe_norm`, `corner_distance`, `dot`, `least`, `greatest` for this package.
 """
 
 import abc
 import functools
+import operator
 from typing import Any
 
 import equinox as eqx
@@ -32,9 +33,45 @@ from . import checks
 Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
 
 
+#: Numbers: where there are more, sums and extrema along an axis of three are taken coordinate by coordinate. XLA does not
+#: vectorise their loops (five times as long); where there are few, the number of its operations counts.
+_MANY = 1 << 14
+
+
+def dot(one: Float[jax.Array, "*batch n"], other: Float[jax.Array, "*batch n"]) -> Float[jax.Array, "*batch"]:
+    """Scalar product along the last axis."""
+    if one.size < _MANY:
+        return jnp.sum(one * other, axis=-1)
+    return functools.reduce(operator.add, (one[..., i] * other[..., i] for i in range(one.shape[-1])))
+
+
+@jax.custom_jvp
+def least(values: tuple[Float[jax.Array, "*batch"], ...]) -> Float[jax.Array, "*batch"]:
+    """The least of some arrays; its gradient is the mean of theirs that are least."""
+    return functools.reduce(jnp.minimum, values)
+
+
+@least.defjvp
+def _(primals, tangents):
+    (values,), (rates,) = primals, tangents
+    found, total, count = values[0], rates[0], jnp.ones_like(values[0])
+    # Each against the least so far, not against the least of all: that one may be rounded another way where XLA repeats it.
+    for value, rate in zip(values[1:], rates[1:], strict=True):
+        lower, upper = value < found, value > found
+        total = jnp.where(lower, rate, jnp.where(upper, total, total + rate))
+        count = jnp.where(lower, 1.0, jnp.where(upper, count, count + 1.0))
+        found = jnp.minimum(found, value)
+    return found, total / count
+
+
+def greatest(values: tuple[Float[jax.Array, "*batch"], ...]) -> Float[jax.Array, "*batch"]:
+    """The greatest of some arrays; its gradient is the mean of theirs that are greatest."""
+    return -least(tuple(-value for value in values))
+
+
 def safe_norm(vectors: Float[jax.Array, "*batch n"]) -> Float[jax.Array, "*batch"]:
     """Length along the last axis, with gradient 0 (not NaN) where it is 0."""
-    square = jnp.sum(vectors**2, axis=-1)
+    square = dot(vectors, vectors)
     # The inner `where` keeps sqrt's infinite slope out of the branch that is not taken.
     return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
@@ -195,7 +232,7 @@ class HalfSpace(Shape):
 
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         points, point, normal = _cast(points, self.point, self.normal)
-        return jnp.sum((points - point) * normal, axis=-1)
+        return dot(points - point, normal)
 
     def bounds(self) -> Bounds:
         point, normal = np.asarray(self.point), np.asarray(self.normal)
@@ -213,7 +250,7 @@ class Union(Shape):
         self.shapes = _shapes("union", shapes)
 
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
-        return jnp.min(jnp.stack([shape.distance(points) for shape in self.shapes]), axis=0)
+        return least(tuple(shape.distance(points) for shape in self.shapes))
 
     def bounds(self) -> Bounds:
         lower, upper = zip(*(shape.bounds() for shape in self.shapes), strict=True)
@@ -229,7 +266,7 @@ class Intersection(Shape):
         self.shapes = _shapes("intersection", shapes)
 
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
-        return jnp.max(jnp.stack([shape.distance(points) for shape in self.shapes]), axis=0)
+        return greatest(tuple(shape.distance(points) for shape in self.shapes))
 
     def bounds(self) -> Bounds:
         lower, upper = zip(*(shape.bounds() for shape in self.shapes), strict=True)
@@ -246,7 +283,7 @@ class Difference(Shape):
         self.shape, self.removed = _shapes("difference", (shape, removed))
 
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
-        return jnp.max(jnp.stack([self.shape.distance(points), -self.removed.distance(points)]), axis=0)
+        return greatest((self.shape.distance(points), -self.removed.distance(points)))
 
     def bounds(self) -> Bounds:
         return self.shape.bounds()
@@ -290,7 +327,7 @@ class Rotated(Shape):
         points, axis, angle, center = _cast(points, self.axis, self.angle, self.center)
         # Rodrigues' formula with -angle: the points turn back, and the shape stays.
         arm = points - center
-        along = axis * jnp.sum(arm * axis, axis=-1, keepdims=True)
+        along = axis * dot(arm, axis)[..., None]
         turned = along + (arm - along) * jnp.cos(angle) - jnp.cross(axis, arm) * jnp.sin(angle)
         return self.shape.distance(turned + center)
 
@@ -329,7 +366,7 @@ def _cast(points: Any, *parameters: checks.Numbers) -> tuple[jax.Array, ...]:
 
 
 def _cylindrical(arm: jax.Array, axis: jax.Array) -> tuple[jax.Array, jax.Array]:
-    height = jnp.sum(arm * axis, axis=-1)
+    height = dot(arm, axis)
     return safe_norm(arm - height[..., None] * axis), height
 
 
@@ -340,6 +377,6 @@ def _across(axis: Any) -> np.ndarray:
 
 def corner_distance(excess: jax.Array) -> jax.Array:
     # Distance to a convex corner of planes, from how far the point is beyond each plane.
-    inside = jnp.max(excess, axis=-1)
+    inside = jnp.max(excess, axis=-1) if excess.size < _MANY else greatest(tuple(jnp.moveaxis(excess, -1, 0)))
     # Not the usual sum of an outside and an inside term: on a face that would halve the gradient.
     return jnp.where(inside > 0, safe_norm(jnp.maximum(excess, 0)), inside)
