@@ -1,9 +1,9 @@
 """How fast a sweep, a bounce and a whole solve are, and how their time grows.
 
 Times of sweeps are given in nanoseconds for each voxel and direction, all bands together. In vacuum a bounce needs no sweep:
-its links tell who sees whom, found once at the price given. "one part" is the same sweep with all directions in one program,
-whose steps XLA splits over the cores; else each core goes through its own part of the directions. Every row is measured in a
-process of its own, alternating the variants; medians of warm runs.
+its links tell who sees whom, found once at the price given. "by XLA" is the same sweep without the loops of our own that numba
+compiles: where it is not installed, both are the same. Every row is measured in a process of its own, alternating the variants;
+medians of warm runs.
 
 Public names: `sweeps`, `solves`, `speed_table`, `CASES`, `SCENES`.
 """
@@ -52,7 +52,7 @@ def _sweep(case: str, size: int, count: int, bands: int, repeats: int) -> dict[s
     import raymanifold_jax as rm
     from raymanifold_jax.operator import Light, make_transport, materials
     from raymanifold_jax.prepare import prepare
-    from raymanifold_jax.transport import cores
+    from raymanifold_jax.transport import native
 
     scene = rm.scenes.ring(size) if case == "vacuum" else rm.scenes.three_balls_in_fog(size)
     if case == "heterogeneous":
@@ -68,16 +68,16 @@ def _sweep(case: str, size: int, count: int, bands: int, repeats: int) -> dict[s
     light = Light(
         jnp.ones((bands, prepared.layout.elements)), None if extinction is None else jnp.ones((bands, *scene.lattice.shape))
     )
-    all_cores = cores.count_cores
+    serves = native.serves
 
-    def in_one_part():
-        cores.count_cores = lambda: 1
+    def by_xla():
+        native.serves = lambda *_: False
         try:
             return transport(light)
         finally:
-            cores.count_cores = all_cores
+            native.serves = serves
 
-    works = {"sweep": lambda: transport(light), "one part": in_one_part}
+    works = {"sweep": lambda: transport(light), "by XLA": by_xla}
     if transport.links is not None:
         works["bounce"] = lambda: transport(light, fluence=False)
     asked = Light(light.elements) if transport.links is not None else light
@@ -129,7 +129,7 @@ def speed_table(records: list[dict[str, Any]]) -> str:
     """Sweeps, then solves, then how their time grows."""
     swept = [r for r in records if r["kind"] == "sweep"]
     solved = [r for r in records if r["kind"] == "solve"]
-    names = ("sweep", "one part", "bounce", "transposed", "finding links")
+    names = ("sweep", "by XLA", "bounce", "transposed", "finding links")
     lines = [f"{'ns a voxel-direction':22}{'size':>5}{'dirs':>6}{'bands':>6}" + "".join(f"{n:>15}" for n in names)]
     for r in swept:
         cells = "".join(f"{r['nanoseconds'][n]:15.2f}" if n in r["nanoseconds"] else f"{'':15}" for n in names)

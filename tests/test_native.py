@@ -17,6 +17,7 @@ from raymanifold_jax.operator import Transport, _slopes, make_transport, materia
 from raymanifold_jax.prepare import prepare
 from raymanifold_jax.transport import derivative, native
 from raymanifold_jax.transport.characteristic import Inflow
+from raymanifold_jax.transport.links import find_links
 
 pytest.importorskip("numba", reason="the extra `fast`")
 
@@ -124,6 +125,25 @@ def test_without_fluence():
     elements, voxels = native.sweep(manner, *given)
     assert voxels is None
     _close(elements, derivative._sweep_program(manner, *given)[0], case.free)
+
+
+@pytest.mark.parametrize("boundary", [_ROOM, _AROUND], ids=["room", "around an axis, mirrored"])
+def test_links(boundary, monkeypatch):
+    case = _Case(_box(None, boundary))
+    found = find_links(case.layout, case.transport.ordinates)
+    monkeypatch.setattr(native, "serves", lambda *_: False)
+    expected = find_links(case.layout, case.transport.ordinates)
+    for method in ("arriving", "sent"):
+        _close(getattr(found, method)(case.elements), getattr(expected, method)(case.elements), case.free)
+
+
+def test_a_plain_install_gives_the_same_light(monkeypatch):
+    scene = _SCENES["thin fog"]()
+    found = rm.solve(scene, rm.quadrature.fibonacci(40), rtol=1e-8, progress=False)
+    monkeypatch.setattr(native, "installed", lambda: False)
+    expected = rm.solve(scene, rm.quadrature.fibonacci(40), rtol=1e-8, progress=False)
+    np.testing.assert_allclose(found.fluence, expected.fluence, rtol=1e-7)
+    np.testing.assert_allclose(found.surfaces.irradiance, expected.surfaces.irradiance, rtol=0, atol=1e-7)
 
 
 def test_single_precision_is_single():

@@ -6,7 +6,7 @@ directions and extinction are. Each core takes some of the directions through al
 This serves known numbers of one device that is a CPU, where numba is installed; all else is left to `characteristic`, which
 gives the same results to rounding.
 
-Public: `serves`, `sweep`, `unsweep`, `views`, `Seen`.
+Public: `installed`, `serves`, `sweep`, `unsweep`, `views`, `Seen`.
 """
 
 from __future__ import annotations
@@ -35,14 +35,14 @@ T = TypeVar("T")
 
 
 @functools.cache
-def _installed() -> bool:
+def installed() -> bool:
     return importlib.util.find_spec("numba") is not None
 
 
 def serves(layout: Any, ordinates: tuple[Ordinates, ...], arguments: Any) -> bool:
     """Whether a sweep of these can be done here."""
     known = isinstance(layout, Layout) and not checks.is_traced((layout, ordinates, arguments))
-    return known and _installed() and on_cpu(ordinates)
+    return known and installed() and on_cpu(ordinates)
 
 
 class _Axis(NamedTuple):
