@@ -181,20 +181,21 @@ def _medium(manner: Manner, layout: Layout | Partition, extinction, source, slop
 
 
 def _sweep(manner: Manner, *arguments) -> Results:
-    if native.serves(*arguments[:2], arguments[2:]):
+    if native.serves(arguments[0], arguments[1], arguments[2:]):
         return native.sweep(manner, *arguments)
     return sum_over_cores(_sweep_program, (manner,), *arguments)
 
 
 def _unsweep(manner: Manner, sloped: bool, *arguments) -> Sent:
-    if native.serves(*arguments[:2], arguments[2:]):
-        return native.unsweep(manner, *arguments, sloped)
+    layout, ordinates, *asked = arguments
+    if native.serves(layout, ordinates, asked):
+        return native.unsweep(manner, *arguments, sloped=sloped)
     return sum_over_cores(_unsweep_program, (manner, sloped), *arguments)
 
 
 def _adjoint(manner: Manner, whole: bool, layout, ordinates, extinction, weights: Results, sent: Sent, inflow) -> Adjoint:
     arguments = layout, ordinates, extinction, weights, sent, inflow
-    if not whole and inflow is None and native.serves(*arguments[:2], arguments[2:]):
+    if not whole and inflow is None and native.serves(layout, ordinates, arguments[2:]):
         found = native.unsweep(manner, layout, ordinates, extinction, *weights, sent[2] is not None)
         return Adjoint(*found, None, None, None)
     return sum_over_cores(_adjoint_program, (manner, whole), *arguments)

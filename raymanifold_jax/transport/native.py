@@ -107,15 +107,17 @@ def sweep(
     if extinction is not None:
         dark = jnp.zeros((bands, *layout.shape), real)
         volume = np.asarray(layout.to_padded(dark if source is None else source))
-    sloped = volume is not None and slopes is not None
+    slopes = None if volume is None else slopes
+    sloped = slopes is not None
     at_elements = np.zeros((bands, layout.elements))
     in_voxels = np.zeros((bands, *layout.padded), real)
 
     def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
-        planes, cut, *readers = arguments
+        planes, cut, hits, probes = arguments
+        readers = hits, probes
         light = _frozen(code.Light(
             source=np.zeros((1, bands, 1), real) if volume is None else _planes(volume, axis),
-            slopes=tuple(_planes(np.asarray(slopes[a]), axis) if sloped else np.zeros((1, 1, 1), real) for a in AXES[axis]),
+            slopes=tuple(_planes(np.asarray(slopes[a]), axis) if slopes else np.zeros((1, 1, 1), real) for a in AXES[axis]),
             cut=_gathered(sent, layout, line.at_cut, len(line.cut.cell)),
             ghost=_gathered(sent, layout, line.at_ghost, len(line.ghosts.cell)),
             radiance=np.zeros((0, 1, bands), real) if inflow is None else np.asarray(inflow.radiance),
@@ -125,7 +127,7 @@ def sweep(
         def run(part: np.ndarray):
             sums = [np.zeros((bands, len(r.cell))) for r in readers]
             voxels, work = np.zeros((line.shape[0], bands, line.area), real), _work(code, line, min(how.rows, len(part)), real)
-            code.forwards(part, line.ways, planes, cut, line.ghosts, *readers, light, how, work, *sums, voxels)
+            code.forwards(part, line.ways, planes, cut, line.ghosts, hits, probes, light, how, work, sums[0], sums[1], voxels)
             return sums, voxels
 
         for sums, voxels in on_cores(run, line.parts):
@@ -162,9 +164,10 @@ def unsweep(
     manner = dataclasses.replace(manner, fluence=volume is not None)
 
     def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
-        planes, cut, *readers = arguments
+        planes, cut, hits, probes = arguments
+        readers = hits, probes
         wanted = _frozen(np.zeros((1, bands, 1), real) if volume is None else _planes(volume, axis))
-        of_readers = _frozen(tuple(asked[:, r.element] for r in readers))
+        of_hits, of_probes = _frozen(tuple(asked[:, r.element] for r in readers))
 
         def run(part: np.ndarray):
             field = lambda there: np.zeros((line.shape[0], bands, line.area) if there else (1, 1, 1), real)
@@ -172,7 +175,7 @@ def unsweep(
             slopes, nothing = (field(sloped), field(sloped), field(sloped)), np.zeros((0, 1, 1), real)
             back = code.Light(field(medium), slopes, listed(line.cut), listed(line.ghosts), nothing, nothing[:, 0])
             work = _work(code, line, min(how.rows, len(part)), real)
-            code.backwards(part, line.ways, planes, cut, line.ghosts, *readers, how, work, *of_readers, wanted, back)
+            code.backwards(part, line.ways, planes, cut, line.ghosts, hits, probes, how, work, of_hits, of_probes, wanted, back)
             return back
 
         for back in on_cores(run, line.parts):
@@ -204,7 +207,8 @@ def views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray)
     real, found = np.dtype(layout.plane.dtype), []
 
     def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
-        planes, cut, *readers = arguments
+        planes, cut, hits, probes = arguments
+        readers = hits, probes
         codes = numbers.transpose(AXES[axis]).reshape(-1).astype(np.int32)
         listed = _frozen(tuple(codes[_flat(cells, line.area)] for cells in (cut, line.ghosts)))
 
@@ -215,8 +219,9 @@ def views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray)
             for _ in range(2):  # how long the lists must be, and what is in them
                 seen, filled = [np.zeros(len(r.cell), int) for r in readers], lists(most)
                 work = _work(code, line, min(how.rows, len(part)), np.dtype(np.int32))
-                of_each = ((s, *f) for s, f in zip(seen, filled, strict=True))
-                code.views(part, line.ways, planes, cut, line.ghosts, *readers, how, work, *listed, *of_each)
+                of_hits, of_probes = ((s, *f) for s, f in zip(seen, filled, strict=True))
+                there = listed[0], listed[1], of_hits, of_probes
+                code.views(part, line.ways, planes, cut, line.ghosts, hits, probes, how, work, *there)
                 most = tuple(int(s.max(initial=0)) for s in seen)
             return filled
 
@@ -319,11 +324,13 @@ def _factor(layout: Layout, line: _Axis, inflow: Inflow | None, bands: int) -> n
 
 
 def _axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
-    assert own.hit_bits is not None and own.probe_bits is not None  # by mark_hits
-    return _keep((layout.plane, own.weight, own.hit_bits), ("axis", axis), lambda: _make_axis(layout, own, axis))
+    anchors = layout.plane, own.weight, own.laps, own.hit_bits
+    assert own.hit_bits is not None  # by mark_hits
+    return _keep(anchors, ("axis", axis), lambda: _make_axis(layout, own, axis))
 
 
 def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
+    assert own.hit_bits is not None and own.probe_bits is not None  # by mark_hits
     from . import machine_code as code
 
     order = AXES[axis]
@@ -378,7 +385,7 @@ def _cells(code, chosen: np.ndarray, plane, image: np.ndarray | None, real: np.d
 def _readers(code, reads: Reads, marks: np.ndarray, number: np.ndarray, surface: np.ndarray, area: int) -> machine_code.Readers:
     """Reads in runs of the same plane and surface; `marks` [N, M] tells who reads in which direction."""
     plane = np.repeat(np.arange(len(reads.first_tile) - 1), np.diff(np.asarray(reads.first_tile)) * reads.tile)
-    used = np.nonzero(sum(np.abs(np.asarray(n))[: len(plane)] for n in reads.plane[1:]) > 0)[0]  # the rest only pads
+    used = np.nonzero(np.any([np.asarray(n)[: len(plane)] != 0 for n in reads.plane[1:]], axis=0))[0]  # the rest only pads
     plane, cell = plane[used], np.asarray(reads.cell)[used].astype(int)
     where = plane * area + cell
     cut = np.where(surface.ravel()[where], number[where], -1)
