@@ -324,9 +324,8 @@ def _factor(layout: Layout, line: _Axis, inflow: Inflow | None, bands: int) -> n
 
 
 def _axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
-    anchors = layout.plane, own.weight, own.laps, own.hit_bits
     assert own.hit_bits is not None  # by mark_hits
-    return _keep(anchors, ("axis", axis), lambda: _make_axis(layout, own, axis))
+    return _keep((layout.plane, own.weight, own.laps, own.hit_bits), ("axis", axis), lambda: _make_axis(layout, own, axis))
 
 
 def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
