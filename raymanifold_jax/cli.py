@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from .solution import Solution
 
 _BRIGHT, _BRIGHT_SHARE = 0.9, 99.0  # auto exposure: this percentile of the radiance becomes this much of white
-_CACHED_FROM = 0.2  # seconds: programs that compile faster are not kept
+_CACHED_FROM = 0.02  # seconds: programs that compile faster are not kept; the many small ones add up
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})

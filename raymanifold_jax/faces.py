@@ -89,7 +89,8 @@ def _padded(rows: np.ndarray, size: int) -> np.ndarray:
 def _in_blocks(function: Callable, rows: tuple[np.ndarray, ...], size: int) -> list[Any]:
     """function(*block) for blocks of rows, some at once: the host works on one while a program runs for another."""
     blocks = [tuple(a[i : i + size] for a in rows) for i in range(0, max(len(rows[0]), 1), size)]
-    device = jax.config.jax_default_device  # contexts hold for one thread only
+    # Contexts hold for one thread only.
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
 
     def run(block: tuple[np.ndarray, ...]) -> Any:
         with jax.enable_x64(True), jax.default_device(device):
@@ -438,9 +439,9 @@ def _moved(center, patch: Array, value: Array, slope: Array, spacing: float) -> 
     return center[:, None] + patch * spacing, patch
 
 
-def _grid_axes(patch: Array) -> np.ndarray:
+def _grid_axes(patch: Array) -> Array:
     """The axis that each point's grid looks along."""
-    return np.repeat(np.eye(3), patch.shape[1] // 3, axis=0)
+    return jnp.asarray(np.repeat(np.eye(3), patch.shape[1] // 3, axis=0))
 
 
 @jax.jit
