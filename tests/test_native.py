@@ -146,6 +146,15 @@ def test_a_plain_install_gives_the_same_light(monkeypatch):
     np.testing.assert_allclose(found.surfaces.irradiance, expected.surfaces.irradiance, rtol=0, atol=1e-7)
 
 
+def test_a_numba_that_does_not_import_is_told_and_left_alone(monkeypatch):
+    def broken(*_):
+        raise ImportError("Numba needs NumPy 1.0 or less")
+
+    monkeypatch.setattr(native.importlib, "import_module", broken)
+    with pytest.warns(UserWarning, match="sweeps take longer: Numba needs NumPy"):
+        assert not native.installed.__wrapped__()
+
+
 def test_single_precision_is_single():
     with jax.enable_x64(False):
         solution = rm.solve(_SCENES["thin fog"](), rtol=1e-3, progress=False)

@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib
 import importlib.util
+import warnings
 import weakref
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -36,7 +38,15 @@ T = TypeVar("T")
 
 @functools.cache
 def installed() -> bool:
-    return importlib.util.find_spec("numba") is not None
+    """Whether the loops can be used: numba is installed, fits numpy's version, and has a place for what it compiles."""
+    if importlib.util.find_spec("numba") is None:
+        return False
+    try:
+        importlib.import_module(".machine_code", __package__)
+    except (ImportError, RuntimeError) as problem:
+        warnings.warn(f"numba cannot be used here, so sweeps take longer: {problem}", stacklevel=2)
+        return False
+    return True
 
 
 def serves(layout: Any, ordinates: tuple[Ordinates, ...], arguments: Any) -> bool:
