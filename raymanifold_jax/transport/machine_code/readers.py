@@ -10,11 +10,9 @@ from __future__ import annotations
 import numpy as np
 from numba.extending import register_jitable
 
+from ..characteristic import _BEHIND, _ONWARD
+from ..slopes import THIN
 from .paths import attenuation, compiled
-
-BEHIND = 0.05  # as in `characteristic`
-ONWARD = 2.0
-THIN = 0.1  # as in `slopes`
 
 
 @register_jitable
@@ -57,7 +55,7 @@ def _form_of_hits(readers, r, extinction, count, way, length, manner, form):
     for number in range(count):
         share = way.share[number]
         g0, g1 = height_of(readers.face, r, way.begin, number), height_of(readers.face, r, way.end, number)
-        if g0 >= -BEHIND and g1 < 0 and share > 0 and g0 > g1:
+        if g0 >= -_BEHIND and g1 < 0 and share > 0 and g0 > g1:
             hits += 1
             path, kept = share * min(max(g0 / max(g0 - g1, 1e-9), 0.0), 1.0), 1.0
             if manner.medium:
@@ -75,7 +73,7 @@ def _onward_time(readers, r, way, number, middle, depth):
     """The time from the middle of a path on to the element's plane; `depth` is the optical depth of a voxel's side."""
     towards = -tilt(readers.face, r, way.step[0], way.step[1], way.step[2])
     height = readers.height[r] + tilt(readers.face, r, way.begin[number, 0], way.begin[number, 1], way.begin[number, 2])
-    onward = min(max((height - middle * towards) / max(towards, 1e-6), 0.0), ONWARD)
+    onward = min(max((height - middle * towards) / max(towards, 1e-6), 0.0), _ONWARD)
     return onward * min(max(depth / THIN - 1, 0.0), 1.0)
 
 
@@ -157,16 +155,11 @@ def read(paths, readers, ways, n, k, c, count, way, length, rows, margin, light,
         if along >= 0:
             continue
         first, last = readers.first[r], readers.first[r + 1]
-        if not manner.medium or (readers.even[c, r] and last > first + 1):
+        if last > first + 1 and (not manner.medium or readers.even[c, r]):
             depth = readers.depth[c, r] if manner.medium else 0.0
-            if last == first + 1 and not marked(bits, n, first):
-                continue
             if not form_of(paths, readers, r, depth, count, way, length, spacing, cells, manner, form):
                 continue
             scaled(form, -along * ways.weight[n])
-            if last == first + 1:
-                _read_one(c, k, first, readers.cut[r], cell[first], count, form, rows, way, margin, light, manner, sums)
-                continue
             of_band = sums[c]
             for number in range(count):
                 if form[number] != 0:
@@ -181,14 +174,15 @@ def read(paths, readers, ways, n, k, c, count, way, length, rows, margin, light,
         for m in range(first, last):
             if not marked(bits, n, m):
                 continue
-            if not form_of(paths, readers, r, readers.extinction[c, m], count, way, length, spacing, cells, manner, form):
+            extinction = readers.extinction[c, m] if manner.medium else 0.0
+            if not form_of(paths, readers, r, extinction, count, way, length, spacing, cells, manner, form):
                 continue
             scaled(form, -along * ways.weight[n])
             _read_one(c, k, m, readers.cut[r], cell[m], count, form, rows, way, margin, light, manner, sums)
 
 
 @register_jitable
-def _ask_one(c, k, m, paths, j, cell, count, form, asked, begun, here, back, manner, wanted):
+def _ask_one(c, k, m, j, cell, count, form, asked, begun, here, back, manner, wanted):
     value = wanted[c, m]
     for number in range(count):
         asked[number, cell] += form[number] * value
@@ -216,16 +210,11 @@ def ask(paths, readers, ways, n, k, c, count, way, length, asked, back, here, ce
         if along >= 0:
             continue
         first, last, j = readers.first[r], readers.first[r + 1], readers.cut[r]
-        if not manner.medium or (readers.even[c, r] and last > first + 1):
+        if last > first + 1 and (not manner.medium or readers.even[c, r]):
             depth = readers.depth[c, r] if manner.medium else 0.0
-            if last == first + 1 and not marked(bits, n, first):
-                continue
             if not form_of(paths, readers, r, depth, count, way, length, spacing, cells, manner, form):
                 continue
             scaled(form, -along * ways.weight[n])
-            if last == first + 1:
-                _ask_one(c, k, first, paths, j, cell[first], count, form, asked, begun, here, back, manner, wanted)
-                continue
             of_band = wanted[c]
             for number in range(count):
                 if form[number] != 0:
@@ -239,7 +228,8 @@ def ask(paths, readers, ways, n, k, c, count, way, length, asked, back, here, ce
         for m in range(first, last):
             if not marked(bits, n, m):
                 continue
-            if not form_of(paths, readers, r, readers.extinction[c, m], count, way, length, spacing, cells, manner, form):
+            extinction = readers.extinction[c, m] if manner.medium else 0.0
+            if not form_of(paths, readers, r, extinction, count, way, length, spacing, cells, manner, form):
                 continue
             scaled(form, -along * ways.weight[n])
-            _ask_one(c, k, m, paths, j, cell[m], count, form, asked, begun, here, back, manner, wanted)
+            _ask_one(c, k, m, j, cell[m], count, form, asked, begun, here, back, manner, wanted)
