@@ -13,11 +13,14 @@ import numpy as np
 import pytest
 
 import raymanifold_jax as rm
+from raymanifold_jax.layout import make_ordinates
 from raymanifold_jax.operator import Transport, _slopes, make_transport, materials
 from raymanifold_jax.prepare import prepare
 from raymanifold_jax.transport import derivative, native
 from raymanifold_jax.transport.characteristic import Inflow
 from raymanifold_jax.transport.links import find_links
+from raymanifold_jax.transport.marks import mark_hits
+from raymanifold_jax.transport.sharded import plane_size
 
 pytest.importorskip("numba", reason="the extra `fast`")
 
@@ -135,6 +138,19 @@ def test_links(boundary, monkeypatch):
     expected = find_links(case.layout, case.transport.ordinates)
     for method in ("arriving", "sent"):
         _close(getattr(found, method)(case.elements), getattr(expected, method)(case.elements), case.free)
+
+
+@pytest.mark.parametrize("name", ["vacuum", "around an axis, mirrored", "around two axes"])
+def test_marks(name, monkeypatch):
+    layout = _Case(_SCENES[name]()).layout
+    ordinates = make_ordinates(rm.quadrature.for_scene(_SCENES[name](), 40), 1, plane_size(layout))
+    found = mark_hits(layout, ordinates)
+    monkeypatch.setattr(native, "serves", lambda *_: False)
+    for one, other in zip(found, mark_hits(layout, ordinates), strict=True):
+        for chunk, place in np.argwhere(np.asarray(one.weight) > 0):
+            for bits in ("hit_bits", "probe_bits"):
+                a, b = (np.asarray(getattr(o, bits))[chunk, place // 32] >> np.uint32(place % 32) & 1 for o in (one, other))
+                np.testing.assert_array_equal(a, b)
 
 
 def test_a_plain_install_gives_the_same_light(monkeypatch):

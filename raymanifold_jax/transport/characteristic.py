@@ -12,14 +12,13 @@ plane g(e) = offset + n . e = 0 in its voxel, e from the voxel's centre: where g
 arrives at the surface and leaves as the surface's exitant radiance; where it changes from - to +, the free part begins at
 the surface.
 
-Public: `Characteristic`, `sweep`, `SweptMedium`, `Inflow`, `mark_hits`, `count_laps`, `thin_limit`.
+Public: `Characteristic`, `sweep`, `SweptMedium`, `Inflow`, `count_laps`, `thin_limit`.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -27,9 +26,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Float, Int
 
-from ..layout import AXES, AxisReads, Layout, Ordinates, Reads, picked
+from ..layout import AXES, AxisReads, Layout, Ordinates, Reads
 from ..partition import Block
 from ..shift import Ring, shift
 from .slopes import thickness
@@ -603,78 +602,3 @@ def _hit(face: tuple, ends: tuple, share) -> tuple[Array, Array]:
     g0, g1 = _height(face, ends[0]), _height(face, ends[1])
     hit = (g0 >= -_BEHIND) & (g1 < 0) & (share > 0) & (g0 > g1)
     return hit, jnp.clip(g0 / jnp.maximum(g0 - g1, 1e-9), 0.0, 1.0)
-
-
-def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinates, ...]:
-    """Note which directions have rays that arrive at each element in its own voxel: elsewhere its probe is used.
-
-    Rays that come out of a neighbouring voxel below that voxel's plane do not count. They were stopped there, where the
-    neighbour's plane stands proud of a curved surface, and would darken the element.
-    """
-
-    found = []
-    planes = jnp.where(layout.buried, -1.0, layout.plane[0]).ravel(), *(layout.plane[1 + a].ravel() for a in range(3))
-    strides = (layout.padded[1] * layout.padded[2], layout.padded[2], 1)
-    for axis, (own, reads) in enumerate(zip(ordinates, layout.reads, strict=True)):
-        order = AXES[axis]
-        geometry = planes[0], *(planes[1 + a] for a in order)
-        shape, padded = layout.padded_along(axis), tuple(layout.pad[a] > 0 for a in order)
-        voxel = jnp.unravel_index(layout.cell, layout.padded)
-        home = jnp.stack([voxel[a] for a in order])
-        face = layout.face[jnp.array([0, *(1 + a for a in order)])]
-        if own.chunks == 0:
-            bits = jnp.zeros((own.weight.shape[0], -(-own.weight.shape[1] // 32), face.shape[1]), jnp.uint32)
-        else:
-            bits = _hit_bits(geometry, jnp.array([strides[a] for a in order]), shape, padded, own, face, home)
-        found.append(own.marked(*(picked(bits, r.image) for r in reads)))
-    return tuple(found)
-
-
-@eqx.filter_jit  # by axis: in a cubic lattice they share a program
-def _hit_bits(
-    geometry: tuple[Array, ...],
-    strides: Int[Array, "3"],
-    shape: tuple[int, int, int],
-    padded: tuple[bool, ...],
-    ordinates: Ordinates,
-    face: Float[Array, "4 I"],
-    home: Int[Array, "3 I"],
-) -> UInt32[Array, "G words I"]:
-    """For each element image, by its plane along (axis, u, v) and its own voxel; `geometry` is flat, with these `strides`."""
-    if ordinates.weight.shape[0] == 0:
-        return jnp.zeros((0, 1, face.shape[1]), jnp.uint32)
-    count, height, width = shape
-
-    def is_ghost(*place):
-        return sum(((i == 0) | (i == n - 1)) & p for i, n, p in zip(place, shape, padded, strict=True)) > 0
-
-    def one(chunk: Ordinates, face, home):
-        plane, row, column = home
-        face = tuple(component[None] for component in face)
-        chords = _chords(chunk, jnp.where(chunk.sign > 0, plane, count - 1 - plane), width, not padded[2])
-        found, clean = False, True
-        for number, ends in enumerate(chords.ends):
-            hit = _hit(face, ends, chords.share[number][:, None, None])[0][:, 0, 0]
-            offset = jnp.zeros_like(chords.offsets[0]) if number == 0 else chords.offsets[number - 1]
-            along_v = jnp.where((jnp.abs(offset) == 1) & (width > 1), offset, 0)
-            along_u = (offset - along_v) // width
-            step = chunk.sign if number == 0 else 0
-            before = (plane - step) % count, (row - along_u) % height, (column - along_v) % width
-            flat = sum(i * stride for i, stride in zip(before, strides, strict=True))
-            inside = [g[flat] for g in geometry]
-            # The same point seen from the voxel before: one voxel further along the axis that is crossed.
-            offset_type = ends[0][0].dtype
-            back = (jnp.full_like(ends[0][0], step), along_u.astype(offset_type), along_v.astype(offset_type))
-            e = [x + y for x, y in zip(ends[0], back, strict=True)]
-            above = inside[0] + inside[1] * e[0] + inside[2] * e[1] + inside[3] * e[2]
-            # Ghost voxels emit at their faces: what leaves them for the lattice has not been inside a solid.
-            emitted = is_ghost(*before) & ~is_ghost(plane, row, column)
-            found, clean = found | hit, clean & (~hit | (above > -1e-3) | emitted)
-        flags = jnp.asarray(found & clean).astype(jnp.uint32)
-        flags = jnp.pad(flags, (0, -flags.shape[0] % 32)).reshape(-1, 32)
-        return jnp.sum(flags << jnp.arange(32, dtype=jnp.uint32), axis=1, dtype=jnp.uint32)
-
-    def of_chunk(number):
-        return jax.vmap(partial(one, _chunk(ordinates, number)), in_axes=(1, 1), out_axes=1)(face, home)
-
-    return lax.map(of_chunk, jnp.arange(ordinates.weight.shape[0]))

@@ -6,7 +6,7 @@ directions and extinction are. Each core takes some of the directions through al
 This serves known numbers of one device that is a CPU, where numba is installed; all else is left to `characteristic`, which
 gives the same results to rounding.
 
-Public: `installed`, `serves`, `sweep`, `unsweep`, `views`, `Seen`.
+Public: `installed`, `serves`, `sweep`, `unsweep`, `views`, `Seen`, `hit_bits`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int, UInt32
 
 from .. import checks
 from ..layout import AXES, Layout, Ordinates, Reads
@@ -247,6 +247,35 @@ def views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray)
     return [seen for seen in found if seen.weight.size]
 
 
+def hit_bits(
+    geometry: tuple[Array, ...],
+    strides: Int[Array, "3"],
+    shape: tuple[int, int, int],
+    padded: tuple[bool, bool, bool],
+    ordinates: Ordinates,
+    face: Float[Array, "4 I"],
+    home: Int[Array, "3 I"],
+) -> UInt32[Array, "G words I"]:
+    """As in `marks`: bits of the directions whose rays arrive at each element in its own voxel."""
+    from . import machine_code as code
+
+    chunk, place = np.nonzero(np.asarray(ordinates.weight) != 0)
+    plane, row, column = np.asarray(home)
+    order = np.argsort(plane, kind="stable")
+    around = code.Around(*shape, padded, tuple(int(s) for s in strides), np.array([np.asarray(g) for g in geometry]))
+    first = np.searchsorted(plane[order], np.arange(shape[0] + 1))
+    elements = code.Elements(first, np.asarray(face)[:, order], row[order].astype(int), column[order].astype(int))
+    known = _frozen((_ways(code, ordinates, chunk, place), around, elements, chunk, place))
+    found = np.zeros((ordinates.weight.shape[0], -(-ordinates.weight.shape[1] // 32), len(order)), np.uint32)
+    # Directions of a chunk share words: each chunk is one core's.
+    parts = [np.nonzero(chunk % count_cores() == core)[0] for core in range(count_cores())]
+    for _ in on_cores(lambda part: code.mark(part, *known, _segments(code), found), [p for p in parts if len(p)]):
+        pass
+    bits = np.empty_like(found)
+    bits[..., order] = found
+    return jnp.asarray(bits)
+
+
 def _lines(manner: Any, layout: Layout, ordinates, extinction, bands: int, sloped: bool, real: np.dtype) -> Iterator[tuple]:
     """Each axis: its number, what is listed along it, and the arguments of `machine_code`."""
     from . import machine_code as code
@@ -265,15 +294,17 @@ def _manner(code, manner: Any, medium: _Medium, sloped: bool, line: _Axis, real)
     return code.Manner(medium.there, sloped, thin, bool(manner.onward), bool(manner.fluence), thin_limit(real), min(rows, 32))
 
 
+def _segments(code) -> machine_code.Segments:
+    points = np.zeros((3, 3)), np.zeros((3, 3))
+    return code.Segments(np.zeros(3), *points, np.zeros(3, int), np.zeros(3), np.zeros(4, int))
+
+
 def _work(code, line: _Axis, directions: int, real) -> machine_code.Work:
     size, width = line.area, line.shape[2]
-    way = code.Segments(
-        np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3, int), np.zeros(3), np.zeros(4, int)
-    )  # fmt: skip
     return code.Work(
         rows=np.zeros((directions + 4, size + 2 * width), real), nowhere=np.zeros(size, real), asked=np.zeros((3, size), real),
         here=np.zeros((12, int(np.diff(line.cut.first).max())), real), own=np.zeros(directions, int), free=np.zeros(4, int),
-        point=np.zeros(3), whole=np.zeros(3), form=np.zeros(8), way=way,
+        point=np.zeros(3), whole=np.zeros(3), form=np.zeros(8), way=_segments(code),
     )  # fmt: skip
 
 

@@ -18,7 +18,8 @@ from jaxtyping import Array, Float, Int
 from ..layout import Layout, Ordinates
 from ..partition import FIELD, SAME, Partition
 from ..sharding import NAMES
-from .characteristic import Inflow, SweptMedium, count_laps, mark_hits, sweep
+from .characteristic import Inflow, SweptMedium, count_laps, sweep
+from .marks import mark_hits
 from .slopes import source_slopes
 from .transpose import Adjoint, adjoint_sweep
 

@@ -9,20 +9,23 @@ Segments of no length are left out; where the extinction is the same all over a 
 Numbers of whole planes are of the fields' own type; those of elements are worked out in 64 bits.
 
 numba keeps what it has compiled, by the time stamp of the file that holds the outermost function: after a change in another
-file here, touch `evolution.py` and `links.py`.
+file here, touch `evolution.py`, `links.py` and `marks.py`.
 
-Public: `forwards`, `backwards`, `views`, and the tuples that they take.
+Public: `forwards`, `backwards`, `views`, `mark`, and the tuples that they take.
 """
 
-from .arguments import EVEN, PATCHY, UNEVEN, Cells, Light, Manner, Planes, Readers, Segments, Ways, Work
+from .arguments import EVEN, PATCHY, UNEVEN, Around, Cells, Elements, Light, Manner, Planes, Readers, Segments, Ways, Work
 from .evolution import backwards, forwards
 from .links import views
+from .marks import mark
 
 __all__ = [
     "EVEN",
     "PATCHY",
     "UNEVEN",
+    "Around",
     "Cells",
+    "Elements",
     "Light",
     "Manner",
     "Planes",
@@ -32,5 +35,6 @@ __all__ = [
     "Work",
     "backwards",
     "forwards",
+    "mark",
     "views",
 ]

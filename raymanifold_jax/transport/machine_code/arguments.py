@@ -57,6 +57,26 @@ class Readers(NamedTuple):
     extinction: Any  # [C, M] of the voxel
 
 
+class Around(NamedTuple):
+    """The lattice as `mark` looks at it: K planes along one axis, and the surface in every voxel."""
+
+    count: int
+    height: int
+    width: int
+    padded: tuple[bool, bool, bool]  # along (axis, u, v)
+    strides: tuple[int, int, int]
+    planes: Any  # [4, V] offset and normal along (axis, u, v)
+
+
+class Elements(NamedTuple):
+    """Elements plane by plane: those of plane k are first[k] to first[k + 1]."""
+
+    first: Any  # [K + 1]
+    face: Any  # [4, I]
+    row: Any  # [I]
+    column: Any  # [I]
+
+
 class Light(NamedTuple):
     """What is sent (forwards), or asked back of it (backwards)."""
 
