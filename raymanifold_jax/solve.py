@@ -37,7 +37,7 @@ from .quadrature import Quadrature, for_scene
 from .scene import OPEN, PointLight, Scene, Sky, Sun, Wall
 from .sharding import check_mesh
 from .solution import Energy, Solution, _Hidden
-from .solvers import Anderson, Jacobi, Krylov, Orders, automatic
+from .solvers import Anderson, Jacobi, Krylov, Orders, automatic, worth_diffusing
 from .source_checks import check_sources
 from .surfaces import Surfaces
 from .transport.characteristic import Characteristic
@@ -134,7 +134,7 @@ def solve(
             system = System(transport, own, first_flight(scene, surfaces, transport, quadrature, own, prepared))
             # What speeds up and certifies the iteration is the same for other lights.
             values = stop_gradient((stuff.albedo, stuff.scattering_albedo, stuff.extinction))
-            again = lambda make: prepared.reuse(("certificate", *key), values, make, quadrature)
+            again = lambda make, near: prepared.reuse(("certificate", near, *key), values, make, quadrature)
         first = None if start is None or nodes is not None else stored(layout, _sent(start, stuff))
         iteration, chosen = _iterate(system, surfaces, again, float(rtol), chosen, max_sweeps, meter, checkpoint, first)
         hidden = _Hidden(surfaces, prepared if kept else prepared.bare(), quadrature, options)
@@ -196,18 +196,20 @@ def _iterate(
         solver = iteration.solver
     else:
         fresh = []
+        if isinstance(solver, str):
+            paper = again is None
+            solver = Jacobi() if paper else automatic(known, _depth(known.materials, known.transport.layout.spacing))
+        diffuse = again is not None and worth_diffusing(known, solver)
 
         def diffusion_and_certificate():
             fresh.append(True)
-            near = None if again is None else make_diffusion(known.transport, surfaces, known.materials)
+            near = make_diffusion(known.transport, surfaces, known.materials) if diffuse else None
             return near, certify(known if near is None else dataclasses.replace(known, near=near))
 
         make = diffusion_and_certificate
-        near, certificate = make() if again is None or traced else again(make)
+        near, certificate = make() if again is None or traced else again(make, diffuse)
         known = known if near is None else dataclasses.replace(known, near=near)
         certificate = certificate if fresh else dataclasses.replace(certificate, sweeps=0)
-        if isinstance(solver, str):
-            solver = Jacobi() if near is None else automatic(known, _depth(known.materials, known.transport.layout.spacing))
         iteration = Iteration(known, certificate, rtol, most, meter)
         if start is not None:
             iteration.start_from(start)

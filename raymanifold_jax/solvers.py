@@ -9,7 +9,7 @@
 
 All start from the light straight from the sources, and stop on the same certified bound.
 
-Public: `Jacobi`, `Krylov`, `Anderson`, `automatic`.
+Public: `Jacobi`, `Krylov`, `Anderson`, `automatic`, `worth_diffusing`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from .operator import Light
 
 _FEW_BOUNCES = 0.1  # up to this albedo nothing beats adding up orders
 _MANY_BOUNCES = 0.7  # from here on diffusion pays for its making
+_MANY_GATHERED = 0.98  # likewise where a bounce is a gather, of which diffusion takes as long as several
 _THICK = 3.0  # optical depth along the lattice's longest side, likewise
 
 
@@ -129,9 +130,21 @@ def _mixing(changes: list[Light], residual: Light) -> np.ndarray:
     return np.linalg.lstsq(gram, right, rcond=accuracy)[0] * scale / lengths
 
 
+def _largest_albedo(system: System) -> float:
+    return float(system.materials.reflected(jax.tree.map(jnp.ones_like, system.source)).largest())
+
+
 def automatic(system: System, depth: float) -> Jacobi | Krylov:
     """The solver for a scene: by its largest albedo, and by the largest optical depth along an axis of the lattice."""
-    largest = float(system.materials.reflected(jax.tree.map(jnp.ones_like, system.source)).largest())
+    largest = _largest_albedo(system)
     if largest <= _FEW_BOUNCES:
         return Jacobi()
-    return Krylov(diffusion=largest >= _MANY_BOUNCES or depth >= _THICK)
+    many = _MANY_BOUNCES if system.transport.links is None else _MANY_GATHERED
+    return Krylov(diffusion=largest >= many or depth >= _THICK)
+
+
+def worth_diffusing(system: System, solver: object) -> bool:
+    """Whether a solve needs diffusion: to be fast, or only for its certificate."""
+    if system.transport.links is None or not isinstance(solver, Krylov) or solver.diffusion:
+        return True
+    return _largest_albedo(system) >= _MANY_GATHERED
