@@ -58,8 +58,9 @@ def first_flight(
     quadrature: Quadrature,
     materials: Materials,
     prepared: Prepared | None = None,
+    key: tuple = (),
 ) -> Direct:
-    """All light that arrives straight from sources."""
+    """All light that arrives straight from sources; `key` tells the transport among those of the same `prepared`."""
     layout = transport.layout
     dark = _dark(materials)
     sky = sky_inflow(scene, layout, quadrature)
@@ -67,11 +68,18 @@ def first_flight(
     glow = materials.medium_source
     if compact is not None and glow is not None:
         glow = jnp.where(stored(layout, jnp.asarray(compact.emits)), 0.0, glow)
-    swept = _swept(transport, Light(materials.emission, glow), sky)
-    if (points := small_emitters(scene, surfaces, _FEWER_POINTS)) is not None:
-        # The elements' share of the emitters' light is taken exactly; the sweep's share of it is taken out.
-        others = _swept(transport, Light(dark.elements, glow), sky).elements
-        swept = Light(others + stored(layout, _conserved(scene, surfaces, points) / jnp.pi), swept.voxels)
+
+    def of_surfaces_and_skies() -> Light:
+        swept = _swept(transport, Light(materials.emission, glow), sky)
+        if (points := small_emitters(scene, surfaces, _FEWER_POINTS)) is not None:
+            # The elements' share of the emitters' light is taken exactly; the sweep's share of it is taken out.
+            others = _swept(transport, Light(dark.elements, glow), sky).elements
+            swept = Light(others + stored(layout, _conserved(scene, surfaces, points) / jnp.pi), swept.voxels)
+        return swept
+
+    values = materials.emission, glow, sky, materials.extinction, materials.scattering_albedo
+    make = of_surfaces_and_skies
+    swept = make() if prepared is None else prepared.reuse(("surfaces and skies", *key), values, make, quadrature)
     if compact is not None:
         swept = swept + stored(layout, _from_volumes(scene, surfaces, compact))
     for light in scene.lights:

@@ -13,7 +13,6 @@ Public names: `radiance`, `irradiance`, `fluence`, `outgoing_flux`; `surface_rad
 from __future__ import annotations
 
 import itertools
-import weakref
 from typing import Any
 
 import equinox as eqx
@@ -27,6 +26,7 @@ from .cubature import mean_of_rays
 from .direct import emitter_light, sky_radiance, small_emitters
 from .directions import gathering
 from .interpolation import ElementTable, element_table, interpolate_irradiance, slopes
+from .keep import keep
 from .march import fill, interpolate, march_between, transmittance, transmittance_between
 from .scene import MIRROR, OPEN, PERIODIC, SIDES, PointLight, Scene, Solid, Sun, Wall
 from .solution import Solution
@@ -199,19 +199,11 @@ def outgoing_flux(solution: Solution, side: str) -> Float[Array, "nu nv *bands"]
 
 # Looking up
 
-_fields: dict[int, tuple[weakref.ref, LightField]] = {}
-
 
 def light_field(solution: Solution) -> LightField:
     """The solution made ready; made once for each."""
-    known = _fields.get(id(solution))
-    if known is not None and known[0]() is solution:
-        return known[1]
-    field = _light_field(solution)
-    if not checks.is_traced(solution):
-        key = id(solution)
-        _fields[key] = (weakref.ref(solution, lambda _: _fields.pop(key, None)), field)
-    return field
+    make = lambda: _light_field(solution)
+    return make() if checks.is_traced(solution) else keep((solution,), "light field", make)
 
 
 def _light_field(solution: Solution) -> LightField:
@@ -220,7 +212,7 @@ def _light_field(solution: Solution) -> LightField:
     real = solution.diffuse_irradiance.dtype
     spread = lambda o, name: jnp.broadcast_to(jnp.asarray(0.0 if o is None else getattr(o, name), real), (bands,))
     diffuse = fill(solution.diffuse_fluence, solution.free)
-    table = element_table(scene, solution.elements)
+    table = keep((solution.elements,), "element table", lambda: element_table(scene, solution.elements))
     values = solution.diffuse_irradiance.T if len(solution.elements) else jnp.zeros((1, bands), real)
     return LightField(
         scene=scene,

@@ -31,13 +31,13 @@ _BEYOND = 0.5  # of the range of the values around: as far as a result may leave
 
 
 class ElementTable(eqx.Module):
-    """Which elements lie in which voxel.
+    """Which elements lie in the 3 x 3 x 3 voxels around each voxel.
 
-    `row` is flat over the lattice and one layer of ghosts; row 0 of `members` is empty, and -1 stands for no element.
+    `row` is flat over the lattice; row 0 of `around` is empty, and -1 stands for no element.
     """
 
     row: Int[Array, " V"]
-    members: Int[Array, "rows width"]
+    around: Int[Array, "rows K"]
     position: Float[Array, "E 3"]  # voxel coordinates
     normal: Float[Array, "E 3"]
 
@@ -45,25 +45,29 @@ class ElementTable(eqx.Module):
 def element_table(scene: Scene, surfaces: Surfaces) -> ElementTable:
     """The elements of solids and walls by voxel; those of open sides are left out."""
     real = jnp.zeros(0).dtype
-    padded = np.asarray(scene.lattice.shape) + 2
+    shape, number = np.asarray(scene.lattice.shape), max(len(surfaces), 1)
     kept = np.nonzero(~surfaces.open)[0]
-    cell = np.asarray(np.ravel_multi_index(tuple((surfaces.voxel[kept] + 1).T), tuple(padded)))
-    order = np.argsort(cell, kind="stable")
-    cells, first, count = np.unique(cell[order], return_index=True, return_counts=True)
-    members = np.full((len(cells) + 1, max(count.max(initial=0), 1)), -1, np.int32)
-    rows = np.repeat(np.arange(len(cells)), count)
-    members[rows + 1, np.arange(len(order)) - first[rows]] = kept[order]
-    row = np.zeros(padded, np.int32)
-    row.reshape(-1)[cells] = np.arange(1, len(cells) + 1)
-    for axis in range(3):
-        if scene.boundary.sides[2 * axis] is PERIODIC:
-            turned = np.moveaxis(row, axis, 0)
-            turned[0], turned[-1] = turned[-2].copy(), turned[1].copy()
+    kept = kept[np.lexsort(surfaces.voxel[kept].T[::-1])]
+    keys = []
+    for step in _BLOCK:  # each time in order but for the rims: quick to sort
+        beside = surfaces.voxel[kept] + step
+        beside = np.where(scene.boundary.periodic, beside % shape, beside)
+        inside = ((beside >= 0) & (beside < shape)).all(-1)
+        keys.append(np.ravel_multi_index(tuple(beside[inside].T), tuple(shape)) * number + kept[inside])
+    key = np.sort(np.concatenate(keys), kind="stable")
+    # Once each, even where the voxels before and behind are the same one.
+    cell, element = np.divmod(key[np.diff(key, prepend=-1) > 0], number)
+    (first,) = np.nonzero(np.diff(cell, prepend=-1))
+    count = np.diff(first, append=len(cell))
+    around = np.full((len(first) + 1, max(count.max(initial=0), 1)), -1, np.int32)
+    around[np.repeat(np.arange(1, len(first) + 1), count), np.arange(len(cell)) - np.repeat(first, count)] = element
+    row = np.zeros(np.prod(shape), np.int32)
+    row[cell[first]] = np.arange(1, len(first) + 1)
     position = (surfaces.position - scene.lattice.lower) / scene.lattice.spacing
     if not len(surfaces):
         position = np.zeros((1, 3))
     normal = surfaces.normal if len(surfaces) else np.zeros((1, 3))
-    return ElementTable(jnp.asarray(row.ravel()), jnp.asarray(members), jnp.asarray(position, real), jnp.asarray(normal, real))
+    return ElementTable(jnp.asarray(row), jnp.asarray(around), jnp.asarray(position, real), jnp.asarray(normal, real))
 
 
 def slopes(scene: Scene, table: ElementTable, values: Float[Array, "E C"]) -> Float[Array, "E C 3"]:
@@ -126,9 +130,7 @@ def _neighbours(scene: Scene, table: ElementTable, u: Array, normal: Array) -> t
     """Elements in the voxels around points: index (n, k), x_e - x (n, k, 3), and how much they face the same way."""
     shape = np.asarray(scene.lattice.shape)
     home = jnp.clip(jnp.floor(u).astype(jnp.int32), 0, shape - 1)
-    strides = np.array([(shape[1] + 2) * (shape[2] + 2), shape[2] + 2, 1])
-    cell = ((home + 1) @ strides)[:, None] + _BLOCK @ strides
-    member = table.members[table.row[cell]].reshape(len(u), -1)
+    member = table.around[table.row[home @ np.array([shape[1] * shape[2], shape[2], 1])]]
     element = jnp.maximum(member, 0)
     arm = table.position[element] - u[:, None]
     for axis in range(3):

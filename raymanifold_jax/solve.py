@@ -131,7 +131,7 @@ def solve(
             )
             key = (id(quadrature), scene.bands, area is None, mesh)
             transport = prepared.reuse(key, (stuff.extinction, stuff.scattering_albedo), make, quadrature)
-            system = System(transport, own, first_flight(scene, surfaces, transport, quadrature, own, prepared))
+            system = System(transport, own, first_flight(scene, surfaces, transport, quadrature, own, prepared, key))
             # What speeds up and certifies the iteration is the same for other lights.
             values = stop_gradient((stuff.albedo, stuff.scattering_albedo, stuff.extinction))
             again = lambda make, near: prepared.reuse(("certificate", near, *key), values, make, quadrature)

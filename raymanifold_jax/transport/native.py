@@ -16,8 +16,7 @@ import functools
 import importlib
 import importlib.util
 import warnings
-import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax.numpy as jnp
@@ -25,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from .. import checks
+from ..keep import keep
 from ..layout import AXES, Layout, Ordinates, Reads
 from .characteristic import Inflow, thin_limit
 from .cores import count_cores, on_cores, on_cpu
@@ -83,19 +83,6 @@ class _Medium(NamedTuple):
     extinction: np.ndarray
     cut: np.ndarray
     readers: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]  # even, depth, extinction of the hits' and the probes'
-
-
-_kept: dict[tuple, Any] = {}
-
-
-def _keep(anchors: tuple[Array, ...], name: Any, make: Callable[[], T]) -> T:
-    """What `make` gives, as long as all of the `anchors` live."""
-    key = name, *map(id, anchors)
-    if key not in _kept:
-        _kept[key] = make()
-        for anchor in anchors:
-            weakref.finalize(anchor, _kept.pop, key, None)
-    return _kept[key]
 
 
 def sweep(
@@ -366,7 +353,7 @@ def _factor(layout: Layout, line: _Axis, inflow: Inflow | None, bands: int) -> n
 
 def _axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
     assert own.hit_bits is not None  # by mark_hits
-    return _keep((layout.plane, own.weight, own.laps, own.hit_bits), ("axis", axis), lambda: _make_axis(layout, own, axis))
+    return keep((layout.plane, own.weight, own.laps, own.hit_bits), ("axis", axis), lambda: _make_axis(layout, own, axis))
 
 
 def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
@@ -481,7 +468,7 @@ def _medium(layout: Layout, line: _Axis, axis: int, extinction, bands: int, real
         free = np.full((count, bands), code.EVEN), np.zeros((count, bands))
         return _Medium(False, *free, np.zeros((1, 1, 1), real), nothing, (reader, reader))
     name = "medium", axis, id(line.hits.bits)
-    return _keep((layout.plane, extinction), name, lambda: _make_medium(line, axis, extinction, real))
+    return keep((layout.plane, extinction), name, lambda: _make_medium(line, axis, extinction, real))
 
 
 def _make_medium(line: _Axis, axis: int, extinction: Float[Array, "C X Y Z"], real: np.dtype) -> _Medium:
