@@ -1,6 +1,6 @@
 """A solution to turn about in a notebook, by k3d (extra `plot`).
 
-Public names: `view_solution`; `polygons` for this package.
+Public names: `view_solution`; `outlines` and `polygons` for this package.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from .spectra import Bands
 _BRIGHT = 0.8  # what the 99th percentile of radiosities is shown as
 _OPACITY = 1.0  # k3d's factor on the fog's; the solids in it still show
 _CLOSE = 0.95  # of the distance where a ball around the lattice would fill the view
-_MARGIN = 1e-3  # voxels: the plane of a wall's element lies in a face of its voxel
+_MARGIN = 2e-3  # voxels: the plane of a wall's element lies in a face of its voxel
 _CORNERS = np.array([(-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0)])  # voxels: beyond every corner of an element's own
 
 
@@ -34,7 +34,7 @@ def view_solution(solution: Solution, height: int = 512, bands: Bands | None = N
         import k3d
     except ImportError as error:
         raise ImportError("view needs k3d; pip install 'raymanifold-jax[plot]'") from error
-    lattice, elements, radiosity = solution.scene.lattice, solution.elements, np.asarray(solution.surfaces.radiosity, float)
+    lattice, radiosity = solution.scene.lattice, np.asarray(solution.surfaces.radiosity, float)
     seen = radiosity if bands is None else bands.to_rgb(radiosity, white)
     look: dict[str, Any] = {"lighting": 0, "background_color": 0x202020, "camera_up_axis": "z", "grid_visible": False}
     plot = k3d.plot(height=height, camera_auto_fit=False, **look)  # pyright: ignore[reportCallIssue]
@@ -42,12 +42,8 @@ def view_solution(solution: Solution, height: int = 512, bands: Bands | None = N
     # From -y, a little from the right and from above; k3d counts the pitch from the zenith.
     plot.camera = plot.get_auto_camera(_CLOSE, yaw=-80, pitch=72, bounds=bounds)
     if len(radiosity):
-        voxel, normal, area, position = (
-            a[~elements.open] for a in (elements.voxel, elements.normal, elements.area, elements.position)
-        )
-        local = (position - lattice.lower) / lattice.spacing
-        corners, triangles, owner = polygons(voxel, normal, area / lattice.spacing**2, local)
-        vertices = (lattice.lower + corners * lattice.spacing).astype(np.float32)
+        corners, triangles, owner = outlines(solution)
+        vertices = corners.astype(np.float32)
         plot += k3d.mesh(vertices, triangles, colors=_packed(seen)[owner].tolist(), side="front", name="radiosity")
     if solution.scene.medium is not None:
         fluence = np.asarray(solution.diffuse_fluence + solution.sun_fluence, np.float32).mean(0)
@@ -58,11 +54,22 @@ def view_solution(solution: Solution, height: int = 512, bands: Bands | None = N
     return plot
 
 
+def outlines(solution: Solution) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`polygons` of the rows of `solution.surfaces`, in scene units."""
+    lattice, elements = solution.scene.lattice, solution.elements
+    # What solids cover of a side lies within them: there its elements need not be cut to leave no slits at their feet.
+    area = np.where(elements.side < 0, elements.area / lattice.spacing**2, np.inf)
+    shown = elements.voxel, elements.normal, area, (elements.position - lattice.lower) / lattice.spacing
+    corners, triangles, owner = polygons(*(values[~elements.open] for values in shown))
+    return lattice.lower + corners * lattice.spacing, triangles, owner
+
+
 def polygons(
     voxel: np.ndarray, normal: np.ndarray, area: np.ndarray, position: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Vertices (V, 3), triangles (T, 3) and each vertex's element: the part of the element's plane that lies in its voxel and
-    beside the other elements there, scaled to its area. All in voxels; anticlockwise seen from where the normals point."""
+    beside the other elements there, scaled to its area if that is finite. All in voxels; anticlockwise seen from where the
+    normals point."""
     axis = np.eye(3)[np.abs(normal).argmin(1)]
     first = np.cross(normal, axis)
     first /= np.linalg.norm(first, axis=1, keepdims=True)
@@ -81,8 +88,9 @@ def polygons(
     number = np.arange(polygon.shape[1])
     fan = np.cross(polygon[:, 1:-1] - polygon[:, :1], polygon[:, 2:] - polygon[:, :1])
     inside = number[2:] < count[:, None]
-    whole = np.einsum("evd,ed,ev->e", fan, normal, inside) / 2
-    polygon = position[:, None] + np.sqrt(area / whole)[:, None, None] * (polygon - position[:, None])
+    whole = np.maximum(np.einsum("evd,ed,ev->e", fan, normal, inside) / 2, 1e-12)
+    scale = np.sqrt(np.where(np.isfinite(area), area / whole, 1.0))
+    polygon = position[:, None] + scale[:, None, None] * (polygon - position[:, None])
     start = np.cumsum(count) - count
     valid = number < count[:, None]
     triangles = (start[:, None] + number[1:-1])[inside][:, None] + np.array([0, 0, 1])

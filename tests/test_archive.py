@@ -112,6 +112,14 @@ def test_plot_and_notebook_display(solution, tmp_path):
     shown = np.asarray(figure.axes[0].images[0].get_array())
     expected = np.asarray(solution.fluence).mean(-1)[1].T
     np.testing.assert_allclose(shown[shown > 0], expected[expected > 0], rtol=1e-6)
+    # From above: the elements that face up, in the colours of their irradiance, the highest last.
+    seen = figure.axes[3].collections[0]
+    up = np.asarray(solution.surfaces.normals)[:, 2] > 0.02
+    irradiance = np.asarray(solution.surfaces.irradiance, float).mean(-1)[up]
+    height = np.asarray(solution.surfaces.positions)[up, 2]
+    assert len(seen.get_paths()) == len(irradiance)
+    np.testing.assert_allclose(sorted(seen.get_array()), sorted(irradiance), rtol=1e-6)
+    assert np.isclose(seen.get_array()[-1], irradiance[height == height.max()], rtol=1e-6).any()
     with pytest.raises(ValueError, match=r"at: got \[2\.0, 0\.0, 0\.0\], expected a point of the lattice"):
         solution.plot(at=(2, 0, 0))
     html = solution._repr_html_()
@@ -230,7 +238,9 @@ def test_view_shows_every_element_from_its_lit_side(solution):
     table = solution.surfaces
     corners, colors, element = drawn(plot, solution)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    np.testing.assert_allclose(np.bincount(element, np.linalg.norm(cross, axis=1) / 2), table.areas, rtol=1e-3)
+    area, side = np.bincount(element, np.linalg.norm(cross, axis=1) / 2), solution.elements.side[~solution.elements.open]
+    np.testing.assert_allclose(area[side < 0], np.asarray(table.areas)[side < 0], rtol=1e-3)
+    np.testing.assert_allclose(area[side >= 0], LATTICE.spacing**2, rtol=0.01)
     assert (np.einsum("td,td->t", cross, np.asarray(table.normals)[element]) > -1e-6 * np.max(table.areas)).all()
     brightest = int(np.argmax(np.asarray(table.radiosity).reshape(len(table.areas), -1).sum(1)))
     assert colors[element == brightest].min() & 0xFF00 >= (colors & 0xFF00).max() * 0.9
