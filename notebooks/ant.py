@@ -32,4 +32,4 @@ rm.io.write_exr("sky.exr", image)
 shutil.copy(str(files("pyvista") / "examples" / "ant.ply"), "ant.ply")
 if not Path("ant.toml").exists():
     shutil.copy(Path(__file__).with_name("ant.toml"), "ant.toml")
-print("wrote sky.exr, ant.ply and ant.toml; next: raymanifold render ant.toml --out ant.exr")
+print("wrote sky.exr, ant.ply and ant.toml; next: raymanifold render ant.toml --resolution 640x480 --out ant.exr")

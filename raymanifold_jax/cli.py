@@ -24,6 +24,7 @@ from . import __version__
 from .cli_options import (
     Elements,
     Exposure,
+    FileName,
     Resolution,
     SceneName,
     check_writable,
@@ -64,7 +65,7 @@ def main(ctx: click.Context) -> None:
 @scene_argument
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=FileName(),
     callback=output,
     metavar="FILE.exr",
     help="The OpenEXR file; a PNG appears beside it. [default: SCENE.exr]",
@@ -200,7 +201,7 @@ def solve(ctx: click.Context, scene: "SceneEntry", **settings: Any) -> None:
 
 
 @main.command()
-@click.argument("file", type=click.Path(path_type=Path), default="scene.toml", metavar="[FILE.toml]")
+@click.argument("file", type=FileName(), default="scene.toml", metavar="[FILE.toml]")
 @click.option("--force", is_flag=True, help="Replace a file that is there.")
 @click.pass_context
 def init(ctx: click.Context, file: Path, force: bool) -> None:

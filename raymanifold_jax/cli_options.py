@@ -34,6 +34,18 @@ class SceneName(click.ParamType):
             self.fail(str(error), param, ctx)
 
 
+class FileName(click.Path):
+    """A path, which need not be there."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        if "\0" in str(value):
+            self.fail(f"got {str(value)!r}, expected no null character; write another name", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 def _scene_file(path: str) -> "SceneEntry":
     """A scene file as an entry of the catalogue."""
     from .io import load_scene
@@ -181,7 +193,7 @@ solve_options = (
     ),
     click.option(
         "--checkpoint",
-        type=click.Path(path_type=Path),
+        type=FileName(),
         metavar="FILE",
         callback=_checkpoint,
         help="Keep the state of the iteration there, about once a minute.",
@@ -189,7 +201,7 @@ solve_options = (
     click.option("--resume", is_flag=True, help="Go on from the checkpoint, if there is one."),
     click.option(
         "--save",
-        type=click.Path(path_type=Path),
+        type=FileName(),
         metavar="FILE.npz",
         callback=_save,
         help="Keep the solution, for rm.load.",

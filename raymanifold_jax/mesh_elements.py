@@ -6,7 +6,7 @@ Triangles are cut by the planes between voxels. The pieces in one voxel that fac
 
 so that the vector areas of a closed mesh still add up to 0. Pieces inside other solids are left out.
 
-Public for this package: `triangles_of`, `mesh_elements`.
+Public for this package: `triangles_of`, `mesh_elements`, `clipped`.
 """
 
 from __future__ import annotations
@@ -77,8 +77,8 @@ def _pieces(corners: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndar
         row = np.repeat(np.arange(len(polygon)), number)
         cell = low[row] + np.arange(len(row)) - np.repeat(np.cumsum(number) - number, number)
         polygon, count, normal, voxel = polygon[row], count[row], normal[row], voxel[row]
-        polygon, count = _clipped(polygon, count, polygon[..., axis] - cell[:, None])
-        polygon, count = _clipped(polygon, count, cell[:, None] + 1 - polygon[..., axis])
+        polygon, count = clipped(polygon, count, polygon[..., axis] - cell[:, None])
+        polygon, count = clipped(polygon, count, cell[:, None] + 1 - polygon[..., axis])
         keep = count >= 3
         polygon, count, normal = polygon[keep], count[keep], normal[keep]
         voxel = np.column_stack([voxel, cell])[keep]
@@ -93,7 +93,7 @@ def _pieces(corners: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndar
     return voxel[keep], normal[keep], area[keep], middle + _INWARD * normal[keep]
 
 
-def _clipped(polygon: np.ndarray, count: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def clipped(polygon: np.ndarray, count: np.ndarray, height: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Convex polygons (P, V, 3), with `count` corners each, where `height` (P, V) >= 0 (Sutherland & Hodgman 1974)."""
     size = polygon.shape[1]
     number = np.arange(size)

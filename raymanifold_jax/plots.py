@@ -12,6 +12,9 @@ import numpy as np
 
 from . import checks
 from .solution import Solution
+from .viewer import outlines
+
+_EDGE_ON = 0.02  # cosine with the line of sight: surfaces further from it do not show
 
 
 def plot_solution(solution: Solution, at: Any = None) -> Any:
@@ -22,6 +25,7 @@ def plot_solution(solution: Solution, at: Any = None) -> Any:
     the lattice.
     """
     try:
+        from matplotlib.collections import PolyCollection
         from matplotlib.figure import Figure
 
         if not isinstance(Figure, type):  # a stand-in that colour-science leaves where there is no matplotlib
@@ -53,13 +57,21 @@ def plot_solution(solution: Solution, at: Any = None) -> Any:
     figure.colorbar(picture, ax=axes[0], shrink=0.8)
     table = solution.surfaces
     irradiance = np.asarray(table.irradiance, float).reshape(len(table.areas), -1).mean(1)
-    for part, (u, v) in zip(axes[1], ((0, 1), (0, 2)), strict=False):
-        order = np.argsort(np.asarray(table.areas))
-        position = np.asarray(table.positions)[order]
-        dots = part.scatter(position[:, u], position[:, v], c=irradiance[order], s=6, vmin=0)
-        part.set_aspect("equal")
-        _label(part, "irradiance of surface elements, W m$^{-2}$", u, v)
-        figure.colorbar(dots, ax=part, shrink=0.8)
+    corners, _, owner = outlines(solution)
+    pieces = np.split(corners, np.flatnonzero(np.diff(owner)) + 1) if len(owner) else []
+    most = float(irradiance.max(initial=0.0))
+    # Seen along -z and along +y: elements that face the eye, the nearest drawn last.
+    for part, (u, v), axis, towards, seen in zip(axes[1], ((0, 1), (0, 2)), (2, 1), (1, -1), ("above", "-y"), strict=False):
+        facing = np.flatnonzero(towards * np.asarray(table.normals)[:, axis] > _EDGE_ON)
+        order = facing[np.argsort(towards * np.asarray(table.positions)[facing, axis], kind="stable")]
+        picture = PolyCollection(
+            [pieces[i][:, (u, v)] for i in order], array=irradiance[order], edgecolors="face", linewidths=0.2
+        )
+        picture.set_clim(0, most)
+        part.add_collection(picture)
+        part.set(xlim=(lower[u], upper[u]), ylim=(lower[v], upper[v]), aspect="equal")
+        _label(part, f"irradiance from {seen}, W m$^{{-2}}$", u, v)
+    figure.colorbar(picture, ax=axes[1, :2], shrink=0.8)
     _convergence(axes[1, 2], solution)
     figure.suptitle(solution.result)
     return figure
@@ -75,5 +87,5 @@ def _convergence(part: Any, solution: Solution) -> None:
     part.axhline(max(solution.target, 1e-300), ls="--", color="0.4", label="target of the bound")
     if math.isfinite(solution.error_bound) and solution.error_bound > 0:
         part.axhline(solution.error_bound, ls=":", color="C1", label="certified bound")
-    part.set(title="convergence, W m$^{-2}$", xlabel="sweep")
+    part.set(title="convergence, W m$^{-2}$", xlabel="iteration")
     part.legend()

@@ -22,6 +22,7 @@ from .surfaces import Surfaces
 if TYPE_CHECKING:
     from .prepare import Prepared
     from .quadrature import Quadrature
+    from .spectra import Bands
 
 
 class SurfaceTable(NamedTuple):
@@ -137,11 +138,14 @@ class Solution(eqx.Module):
 
         return plot_solution(self, at)
 
-    def view(self, height: int = 512) -> Any:
-        """A `k3d.Plot` to turn about in a notebook: radiosity on surfaces, fluence in the fog (`viewer`)."""
+    def view(self, height: int = 512, bands: Bands | None = None, white: Any = None) -> Any:
+        """A `k3d.Plot` to turn about in a notebook: radiosity on surfaces, fluence in the fog (`viewer`).
+
+        `bands` of wavelength and the light that is `white` give many bands their colours, as in `Bands.to_rgb`.
+        """
         from .viewer import view_solution
 
-        return view_solution(self, height)
+        return view_solution(self, height, bands, white)
 
     def _repr_html_(self) -> str:
         """What a notebook shows."""

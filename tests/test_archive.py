@@ -16,6 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import raymanifold_jax as rm
+from raymanifold_jax.surfaces import find_surfaces
+from raymanifold_jax.viewer import polygons
 
 WALL = rm.Wall(0.9)
 LATTICE = problems.cube(6)
@@ -110,6 +112,14 @@ def test_plot_and_notebook_display(solution, tmp_path):
     shown = np.asarray(figure.axes[0].images[0].get_array())
     expected = np.asarray(solution.fluence).mean(-1)[1].T
     np.testing.assert_allclose(shown[shown > 0], expected[expected > 0], rtol=1e-6)
+    # From above: the elements that face up, in the colours of their irradiance, the highest last.
+    seen = figure.axes[3].collections[0]
+    up = np.asarray(solution.surfaces.normals)[:, 2] > 0.02
+    irradiance = np.asarray(solution.surfaces.irradiance, float).mean(-1)[up]
+    height = np.asarray(solution.surfaces.positions)[up, 2]
+    assert len(seen.get_paths()) == len(irradiance)
+    np.testing.assert_allclose(sorted(seen.get_array()), sorted(irradiance), rtol=1e-6)
+    assert np.isclose(seen.get_array()[-1], irradiance[height == height.max()], rtol=1e-6).any()
     with pytest.raises(ValueError, match=r"at: got \[2\.0, 0\.0, 0\.0\], expected a point of the lattice"):
         solution.plot(at=(2, 0, 0))
     html = solution._repr_html_()
@@ -212,17 +222,56 @@ def test_kill_and_resume(tmp_path):
     np.testing.assert_array_equal(np.load(tmp_path / "resumed.npy"), np.load(tmp_path / "straight.npy"))
 
 
+def drawn(plot, solution):
+    """Corners (T, 3, 3) of the triangles of a view's mesh, their colours, and the element of each."""
+    mesh = next(o for o in plot.objects if o.type == "Mesh")
+    vertices, triangles = np.asarray(mesh.vertices, float).reshape(-1, 3), np.asarray(mesh.indices).reshape(-1, 3)
+    first = triangles[:, 0]  # which an element's triangles share
+    element = np.cumsum(np.diff(first, prepend=first[0]) != 0)
+    assert element[-1] + 1 == len(solution.surfaces.areas)
+    return vertices[triangles], np.asarray(mesh.colors)[triangles[:, 0]], element
+
+
 def test_view_shows_every_element_from_its_lit_side(solution):
     pytest.importorskip("k3d")
     plot = solution.view(height=300)
-    mesh = next(o for o in plot.objects if o.type == "Mesh")
     table = solution.surfaces
-    vertices, triangles = np.asarray(mesh.vertices).reshape(-1, 3), np.asarray(mesh.indices).reshape(-1, 3)
-    a, b, c = (vertices[triangles[:, i]].astype(float) for i in range(3))
-    cross = np.cross(b - a, c - a).reshape(-1, 2, 3)
-    np.testing.assert_allclose(np.linalg.norm(cross, axis=-1).sum(1) / 2, table.areas, rtol=1e-3)
-    assert (np.einsum("eti,ei->et", cross, np.asarray(table.normals, float)) > 0).all()
+    corners, colors, element = drawn(plot, solution)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area, side = np.bincount(element, np.linalg.norm(cross, axis=1) / 2), solution.elements.side[~solution.elements.open]
+    np.testing.assert_allclose(area[side < 0], np.asarray(table.areas)[side < 0], rtol=1e-3)
+    np.testing.assert_allclose(area[side >= 0], LATTICE.spacing**2, rtol=0.01)
+    assert (np.einsum("td,td->t", cross, np.asarray(table.normals)[element]) > -1e-6 * np.max(table.areas)).all()
     brightest = int(np.argmax(np.asarray(table.radiosity).reshape(len(table.areas), -1).sum(1)))
-    assert np.asarray(mesh.colors)[4 * brightest] & 0xFF00 >= (np.asarray(mesh.colors) & 0xFF00).max() * 0.9
+    assert colors[element == brightest].min() & 0xFF00 >= (colors & 0xFF00).max() * 0.9
     assert any(o.type == "Volume" for o in plot.objects) == (solution.scene.medium is not None)
     assert "<html" in plot.get_snapshot().lower()
+
+
+def test_view_has_the_colours_of_bands(solution):
+    pytest.importorskip("k3d")
+    grey = drawn(solution.view(), solution)[1]
+    assert np.array_equal(grey & 0xFF, grey >> 16)
+    colors = drawn(solution.view(bands=rm.spectra.Bands(edges=[400, 550, 700])), solution)[1]
+    assert np.mean((colors & 0xFF) > (colors >> 16)) > 0.3  # the ball's albedo is 0.9 in the blue half, 0.5 in the red
+    with pytest.raises(ValueError, match="3 bands on its last axis"):
+        solution.view(bands=rm.spectra.Bands(edges=[400, 500, 600, 700]))
+
+
+def test_view_leaves_no_slits_in_a_turned_box():
+    # A point on its side lies in one triangle of that side, but for what the elements' areas, sampled at edges, leave open.
+    middle, half, angle = np.array([0.5, 0.5, 0.5]), 0.26, 0.52
+    box = rm.Box(middle - half, middle + half).rotate((0, 0, 1), angle, middle)
+    lattice = problems.cube(10)
+    elements = find_surfaces(rm.Scene(lattice, [rm.Solid(box, 0.5)]))
+    kept = elements.side < 0
+    voxel, normal, area, position = (a[kept] for a in (elements.voxel, elements.normal, elements.area, elements.position))
+    vertices, triangles, _ = polygons(voxel, normal, area / lattice.spacing**2, position / lattice.spacing)
+    corners = vertices[triangles] * lattice.spacing - middle
+    outward, along = np.array([np.cos(angle), np.sin(angle), 0]), np.array([-np.sin(angle), np.cos(angle), 0])
+    corners = corners[(np.abs(corners @ outward - half) < 0.01 * half).all(1)]
+    flat = np.stack([corners @ along, corners[..., 2]], -1)
+    points = np.random.default_rng(1).uniform(-half, half, (1000, 1, 1, 2))
+    edge, to = np.roll(flat, -1, 1) - flat, points - flat
+    covers = (edge[..., 0] * to[..., 1] >= edge[..., 1] * to[..., 0]).all(-1)
+    assert np.mean(covers.sum(1) == 1) > 0.97

@@ -43,7 +43,10 @@ def test_bad_arguments():
 
 @pytest.mark.slow
 def test_eight_bands_have_the_colours_of_sixteen():
-    """Colour differences (CIE 2000) of 8 x 8-pixel means, under the lamp as white. Measured: median 0.6; with 3 bands 2.3."""
+    """Colour differences (CIE 2000) of 8 x 8-pixel means in the lamp's light; white is the brightest of them without the lamp.
+
+    Measured: median 0.9, largest 2.1; with 3 bands 3.4 and 5.1.
+    """
     colour = pytest.importorskip("colour")
     xyz = {}
     for count in (3, 8, 16):
@@ -52,7 +55,9 @@ def test_eight_bands_have_the_colours_of_sixteen():
         camera = rm.scenes.cameras("cornell-box", solution.scene, (128, 128))["front"]
         means = np.asarray(rm.render(solution, camera, 1)).reshape(16, 8, 16, 8, count).mean((1, 3))
         xyz[count] = means @ bands.xyz_matrix(light_values(bands)).T
-    white = np.percentile(xyz[16][..., 1], 99)
-    lab = {count: colour.XYZ_to_Lab(np.clip(v / white, 0, None)) for count, v in xyz.items()}
-    apart = {count: np.median(colour.difference.delta_E_CIE2000(lab[count], lab[16])) for count in (3, 8)}
-    assert apart[8] < 1.0 < apart[3] < 4.0
+    bright = xyz[16][..., 1]
+    seen = (bright > 0) & (bright < 2 * np.percentile(bright, 95))  # without frame and lamp, which is ten times as bright
+    lab = {count: colour.XYZ_to_Lab(np.clip(v[seen] / bright[seen].max(), 0, None)) for count, v in xyz.items()}
+    apart = {count: colour.difference.delta_E_CIE2000(lab[count], lab[16]) for count in (3, 8)}
+    assert np.median(apart[8]) < 1.0 < 3.0 < np.median(apart[3]) < 4.0
+    assert np.max(apart[8]) < 2.5 < np.max(apart[3])

@@ -9,7 +9,7 @@ import contextlib
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 import raymanifold_jax as rm
@@ -124,6 +124,10 @@ OPTIONS = [
     st.sampled_from(["render", "solve", "info", "cost", "init", "scenes", "nonsense"]),
     st.lists(st.one_of(WORDS, st.sampled_from(OPTIONS)), max_size=6),
 )
+@example("init", ["\0"])
+@example("render", ["ring", "--out", "\0.exr"])
+@example("solve", ["ring", "--save", "\0.npz"])
+@example("solve", ["ring", "--checkpoint", "\0"])
 def test_command_lines_are_run_or_refused(tmp_path_factory, command, words):
     def stop(*_, **__):
         raise _Reached

@@ -1,6 +1,8 @@
 """Densities from files, and media made of them. Everything here is exact to rounding."""
 
 import contextlib
+import sys
+import types
 
 import numpy as np
 import pytest
@@ -44,6 +46,46 @@ def test_openvdb(tmp_path):
     grid.name = "density"
     openvdb.write(str(tmp_path / "a.vdb"), grids=[grid])
     np.testing.assert_allclose(rm.io.read_volume(tmp_path / "a.vdb"), DENSITY, rtol=1e-6)
+
+
+class Grid:
+    """What `read_volume` asks of an OpenVDB grid, with the answers that OpenVDB 10.0.1 gives."""
+
+    def __init__(self, name, values, background: object = 0.0):
+        self.name, self.values, self.background = name, np.asarray(values, np.float32), background
+        self.active = (self.values != np.asarray(background)).reshape(*self.values.shape[:3], -1).any(-1)
+
+    def activeVoxelCount(self):
+        return int(self.active.sum())
+
+    def evalActiveVoxelBoundingBox(self):
+        if not self.active.any():
+            return (2**31 - 1,) * 3, (-(2**31),) * 3
+        found = np.argwhere(self.active)
+        return tuple(map(int, found.min(0))), tuple(map(int, found.max(0)))
+
+    def copyToArray(self, array, ijk=(0, 0, 0)):
+        if array.ndim != self.values.ndim:
+            raise ValueError(f"expected {self.values.ndim}-dimensional array, found {array.ndim}-dimensional array")
+        box = tuple(slice(i, i + n) for i, n in zip(ijk, array.shape[:3], strict=True))
+        array[...] = self.values[box]
+
+
+def test_grids_of_openvdb(tmp_path, monkeypatch):
+    """By a stand-in for the module: scalars, vectors, zeros around the active voxels, empty grids and wrong names."""
+    rim = np.pad(DENSITY, ((2, 1), (0, 3), (1, 0)))
+    vectors = np.stack([DENSITY, 2 * DENSITY, 3 * DENSITY], -1)
+    grids = {g.name: g for g in (Grid("smoke", rim), Grid("color", vectors, (0.0,) * 3), Grid("none", np.zeros((2, 2, 2))))}
+    module = types.SimpleNamespace(readAllGridMetadata=lambda path: [*grids.values()], read=lambda path, name: grids[name])
+    monkeypatch.setitem(sys.modules, "openvdb", module)
+    path = tmp_path / "a.vdb"
+    path.touch()
+    np.testing.assert_allclose(rm.io.read_volume(path, "smoke"), DENSITY, rtol=1e-6)
+    np.testing.assert_allclose(rm.io.read_volume(path, "color"), vectors, rtol=1e-6)
+    with pytest.raises(ValueError, match=r"name: got 'none' of .*a\.vdb', which has no active voxels"):
+        rm.io.read_volume(path, "none")
+    with pytest.raises(ValueError, match=r"name: got no name .*expected one of smoke, color, none"):
+        rm.io.read_volume(path)
 
 
 @pytest.mark.parametrize(

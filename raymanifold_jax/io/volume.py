@@ -28,7 +28,8 @@ def read_volume(path: str | os.PathLike[str], name: str | None = None) -> Float[
     """The values of a volume, axes x, y, z and perhaps bands.
 
     **Arguments:** `path`: `.npy`, `.npz`, a `.zarr` directory or zip (needs zarr, extra `volume`), or `.vdb` (needs the
-    `openvdb` module, which comes with OpenVDB). `name`: which of the file's arrays or grids; left out where there is one only.
+    `openvdb` module, which comes with OpenVDB; the box of the grid's active voxels, and vectors are bands). `name`: which of
+    the file's arrays or grids; left out where there is one only.
 
     **Raises** `FileNotFoundError`; `ImportError` without the module; `ValueError` for a damaged file, a missing name, an array
     of other than 3 or 4 axes, or values that are negative or not finite; `TypeError` for values that are not real numbers.
@@ -131,8 +132,10 @@ def _openvdb(path: Path, name: str | None) -> np.ndarray:
         ) from error
     grids = openvdb.readAllGridMetadata(str(path))
     grid = openvdb.read(str(path), _chosen(path, [grid.name for grid in grids], name))
+    if grid.activeVoxelCount() == 0:
+        raise _Refused(f"name: got {grid.name!r} of {str(path)!r}, which has no active voxels; choose another grid")
     lower, upper = (np.array(corner) for corner in grid.evalActiveVoxelBoundingBox())
-    values = np.zeros(upper - lower + 1)
+    values = np.zeros((*(upper - lower + 1), *np.shape(grid.background)))
     grid.copyToArray(values, ijk=tuple(int(i) for i in lower))
     return values
 
