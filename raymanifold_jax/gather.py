@@ -23,8 +23,9 @@ from jaxtyping import Array, Float
 
 from . import checks
 from .cubature import mean_of_rays
-from .direct import emitter_light, sky_radiance, small_emitters
+from .direct import sky_radiance
 from .directions import gathering
+from .emitters import emitter_light, small_emitters
 from .interpolation import ElementTable, element_table, interpolate_irradiance, slopes
 from .keep import keep
 from .march import fill, interpolate, march_between, transmittance, transmittance_between
@@ -126,7 +127,7 @@ def _gathered(solution: Solution, points: Any, normals: Any, number: int | None)
     if compact is not None:
         rest = jnp.where(compact.emits, 0.0, emission_of(scene))
         field = eqx.tree_at(lambda f: f.scene, field, with_emission(scene, rest))
-    emitters = small_emitters(scene, solution.elements) if not _has_images(scene) else None
+    emitters = small_emitters(scene, solution.elements)
     far = np.zeros(len(points), bool) if emitters is None else ~emitters.near(points)
     dark = eqx.tree_at(lambda f: f.emission, field, jnp.zeros_like(field.emission))
     total = jnp.zeros((len(points), scene.bands))

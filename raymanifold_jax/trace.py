@@ -9,7 +9,8 @@ be looked at from outside through its near walls. A solid that touches a side fr
 The functions take arrays in scene units, compute in JAX's default float type, and work on any number of rays. They are not
 made to be differentiated: what is in front of what has no gradient here.
 
-Public: `Hit`, `first_hit`, `visible`; `trace_rays` for a block of rays; and `march`, `transmittance` from `march`.
+Public: `Hit`, `first_hit`, `visible`; for blocks of rays `trace_rays`, `visible_unfolded`, `patch_visible`; and `march`,
+`transmittance` from `march`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from .march import march as march
 from .march import transmittance as transmittance
@@ -184,8 +185,19 @@ def _visible(scene: Scene, start: Array, end: Array) -> Array:
 
 def visible_unfolded(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """`visible` for one block, between points in unfolded voxel coordinates."""
+    return _line_of_sight(scene, o, e, None)[0]
+
+
+def patch_visible(
+    scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"], radius: Float[Array, " n"]
+) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
+    """The same, and whether it holds for all of the patch of that radius around `e`, by how near solids come on the way."""
+    return _line_of_sight(scene, o, e, radius)
+
+
+def _line_of_sight(scene: Scene, o: Array, e: Array, radius: Array | None) -> tuple[Array, Array]:
     if not scene.solids:
-        return jnp.ones(o.shape[:1], o.dtype)
+        return jnp.ones(o.shape[:1], o.dtype), jnp.ones(o.shape[:1], bool)
     axes = unfolded_axes(scene)
     folds = any(axis.kind != "plain" for axis in axes)
     distance = lambda u: _distance(scene, fold(axes, u)[0] if folds else u)
@@ -198,17 +210,27 @@ def visible_unfolded(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"
     bumps = _bumps(scene, o.dtype)
 
     def step(state):
-        t, blocked, free, count = state
+        t, blocked, free, (least, most), count = state
         near = distance(o + t[:, None] * w)
-        going = ~blocked & (t < stop)
+        going = goes_on(state)
         blocks = near < (deepest if bumps is None else jnp.where(free, deepest, deepest - bumps))
         free = free if bumps is None else free | (near > bumps)
-        return jnp.where(going, t + jnp.maximum(jnp.abs(near), _BEHIND), t), blocked | (going & blocks), free, count + 1
+        if radius is not None:
+            # The patch is the base of a cone; close to it, its own surface is no obstacle.
+            cone = radius * jnp.maximum(t, _CRAWL) / jnp.maximum(length, _CRAWL)
+            counts = going & (t < length - 2 * radius)
+            least = jnp.where(counts, jnp.minimum(least, near - cone), least)
+            most = jnp.where(counts, jnp.maximum(most, -near - cone), most)
+        t = jnp.where(going, t + jnp.maximum(jnp.abs(near), _BEHIND), t)
+        return t, blocked | (going & blocks), free, (least, most), count + 1
 
     def goes_on(state):
-        t, blocked, _, count = state
-        return (~blocked & (t < stop)).any() & (count < _STEPS)
+        t, blocked, _, (_, most), _ = state
+        done = blocked if radius is None else blocked & (most > 0)
+        return ~done & (t < stop)
 
-    start = (jnp.zeros_like(stop), jnp.zeros(stop.shape, bool), jnp.zeros(stop.shape, bool), 0)
-    _, blocked, _, _ = lax.while_loop(goes_on, step, start)
-    return jnp.where(blocked, 0.0, 1.0).astype(o.dtype)
+    none = jnp.zeros(stop.shape, bool)
+    start = (jnp.zeros_like(stop), none, none, (jnp.full_like(stop, jnp.inf), jnp.full_like(stop, -jnp.inf)), 0)
+    state = lax.while_loop(lambda s: goes_on(s).any() & (s[4] < _STEPS), step, start)
+    _, blocked, _, (least, most), _ = state
+    return jnp.where(blocked, 0.0, 1.0).astype(o.dtype), jnp.where(blocked, most > 0, least > 0)

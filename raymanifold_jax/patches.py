@@ -1,0 +1,320 @@
+"""Light straight from emitting surfaces to the elements, by patches as large as the distance allows.
+
+Emitting elements are cut into small faces. These are joined again step by step, where they lie side by side and face about
+the same way, into patches of twice the size. An element takes light from each patch that is at most `_WIDTH` times its
+distance wide (compare hierarchical radiosity: Hanrahan, Salzman & Aupperle, SIGGRAPH 1991):
+
+    E(x) = sum over patches of  L A <cos(theta) cos(theta') / r^2> T V.
+
+The mean <> is over four points that have the patch's second moments; visibility V and transmittance T are those of one ray, to
+a face of its middle. Where a solid comes nearer to that ray than the patch is wide, the patch's parts are looked at instead.
+
+Public: `light_of_emitters`, `may_serve`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from . import checks
+from .directions import frames
+from .emitters import CLEARANCE, SMALL, EmittingFaces, emitting_faces, share_that_emits
+from .march import transmittance_between
+from .scene import OPEN, Scene, Wall
+from .surfaces import Surfaces
+from .trace import patch_visible
+from .unfolding import in_blocks, sloped, unfolded_axes
+
+_WIDTH = 0.35  # of a patch, at most, for its distance
+_FINER = 4.0  # times, where only a part of a curved patch can be seen
+_ROUNDS = 5  # of taking parts instead, where not all of a patch may be seen
+_RADIUS = 0.8  # of a patch, for its size
+_FACES = 8  # along an element's side; half of it where there are many
+_MANY = 4096
+_BLOCK = 1 << 11  # elements at once
+_MINOR = 2e-3  # of an element's light: patches that send less are seen or not seen as a whole
+_FAINT = 1e-6  # of an element's light: no ray for less
+_SAMPLE = 256
+_MOST = 0.5  # of the surfaces
+_TOLERANCE = 3e-3  # rms over elements, of their mean: what the sweep's directions may be off
+_CODES = 125  # of normals: what faces about the same way has the same
+_FOUR = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
+
+
+class _Patches(NamedTuple):
+    """Patches of all sizes; lengths are in voxels, positions in unfolded voxel coordinates."""
+
+    size: Float[np.ndarray, " n"]
+    center: Float[np.ndarray, "n 3"]
+    normal: Float[np.ndarray, "n 3"]
+    arms: Float[np.ndarray, "n 2 3"]  # from the centre to two of the four points
+    area: Float[np.ndarray, " n"]  # of its projection along the normal
+    turn: Float[np.ndarray, " n"]  # radians: how far its parts' normals are from its own, at most
+    owner: Int[np.ndarray, " n"]
+    target: Float[np.ndarray, "n 3"]  # where its ray ends
+    first: Int[np.ndarray, " n"]  # its parts: rows first to first + count; none of the smallest
+    count: Int[np.ndarray, " n"]
+
+
+class _Pairs(NamedTuple):
+    """Elements, numbered within a block, and patches they look at."""
+
+    element: Int[np.ndarray, " p"]
+    patch: Int[np.ndarray, " p"]
+    geometry: Float[np.ndarray, " p"]  # A <cos cos' / r^2>
+
+    def kept(self, chosen: np.ndarray) -> _Pairs:
+        return _Pairs(*(values[chosen] for values in self))
+
+    @staticmethod
+    def joined(parts: list[_Pairs]) -> _Pairs:
+        if not parts:
+            return _Pairs(np.zeros(0, int), np.zeros(0, int), np.zeros(0))
+        return _Pairs(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def may_serve(scene: Scene, surfaces: Surfaces) -> bool:
+    """Whether patches could do better than the sweep.
+
+    Not where most of the surfaces emit, and light is nearly even; nor where light goes around by mirrors or periodic sides
+    without end.
+    """
+    endless = any(np.isinf(axis.upper) for axis in unfolded_axes(scene))
+    return not endless and 0 < share_that_emits(scene, surfaces) <= _MOST
+
+
+def light_of_emitters(
+    scene: Scene, surfaces: Surfaces, radiance: Float[Array, "C owners"], swept: Float[Array, "C E"], total: Float[Array, "C E"]
+) -> Float[Array, "C E"] | None:
+    """Irradiance of the elements by a `radiance` of the emitting solids and sides; None where the sweep will do.
+
+    That is where its directions are good enough: where what was `swept` of the same is near enough, for the `total`, as some
+    elements tell. While JAX stages a program none does; then emitters that cover more than a small part are left to the sweep.
+    """
+    share = share_that_emits(scene, surfaces)
+    known = lax.stop_gradient((radiance, swept, total, scene.medium))
+    if checks.is_traced(known) and share > SMALL:
+        return None
+    side = _FACES if share * len(surfaces) <= _MANY else _FACES // 2
+    faces = emitting_faces(scene, surfaces, side)
+    patches = _patches(scene, faces, side)
+    if not checks.is_traced(known):
+        rows = _sample(surfaces)
+        exact, _ = _arriving(_still(scene), patches, surfaces, rows, known[0])
+        off = np.sqrt(np.mean((np.asarray(known[1])[:, rows] - np.asarray(exact)) ** 2, axis=1))
+        if np.all(off <= _TOLERANCE * np.asarray(known[2])[:, rows].mean(1)):
+            return None
+    found, unattenuated = _arriving(scene, patches, surfaces, np.arange(len(surfaces)), radiance)
+    return found * _conserving(scene, surfaces, faces, np.asarray(unattenuated))
+
+
+def _still(scene: Scene) -> Scene:
+    return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_inexact_array(a) else a, scene)
+
+
+def _sample(surfaces: Surfaces) -> np.ndarray:
+    """Some elements, evenly by area."""
+    share = np.cumsum(surfaces.area) / surfaces.area.sum()
+    return np.unique(np.searchsorted(share, (np.arange(_SAMPLE) + 0.5) / _SAMPLE))
+
+
+def _conserving(scene: Scene, surfaces: Surfaces, faces: EmittingFaces, unattenuated: np.ndarray) -> float:
+    """The factor by which all the power sent would arrive in vacuum (by about 0.2 % more or less at 16^3).
+
+    Elements are read at their middles, which counts a little too much where the light is near.
+    """
+    if not all(side is OPEN or isinstance(side, Wall) for side in scene.boundary.sides):
+        return 1.0  # some of it leaves through mirrors
+    received = unattenuated @ surfaces.area
+    return float(np.clip(np.pi * faces.area.sum() / received, 0.95, 1.05)) if received > 0 else 1.0
+
+
+# The patches
+
+
+def _patches(scene: Scene, faces: EmittingFaces, side: int) -> _Patches:
+    """From the smallest to the one or the few that nothing can be joined to, which come last."""
+    spacing = scene.lattice.spacing
+    faces = faces._replace(position=(faces.position - scene.lattice.lower) / spacing, area=faces.area / spacing**2)
+    faces = _with_images(scene, faces)
+    size = 1 / side
+    two = frames(faces.normal)[:, :2]
+    moments = np.einsum("nki,nkj->nij", two, two) * (size**2 / 12) + faces.position[:, :, None] * faces.position[:, None]
+    none = np.zeros(len(faces.area), int)
+    steps = [_of_size(size, faces.position, faces.normal, moments, faces.area, faces.owner, faces.position, none, none)]
+    code = (np.round(2 * faces.normal).astype(int) + 2) @ np.array([25, 5, 1])
+    while size < 2 * max(scene.lattice.shape) and len(steps[-1].area) > 1:
+        size *= 2
+        # Off the planes of the lattice, for rounding not to part what lies in one.
+        cell = np.floor((steps[-1].center + 0.37 / side) / size).astype(int)
+        cell -= cell.min(0)
+        key = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(0) + 1)) * _CODES + code
+        key = key * (int(faces.owner.max()) + 1) + steps[-1].owner
+        order = np.argsort(key, kind="stable")
+        parts = steps[-1] = _Patches(*(values[order] for values in steps[-1]))
+        first = np.nonzero(np.diff(key[order], prepend=-1))[0]
+        moments, target = _joined(parts, moments[order], first)
+        steps.append(target._replace(size=np.full(len(first), size)))
+        code = code[order][first]
+    # One table: parts are numbered from the beginning of all.
+    begins = np.cumsum([0, 0, *(len(step.area) for step in steps)])
+    steps = [step._replace(first=step.first + begin) for step, begin in zip(steps, begins, strict=False)]
+    return _Patches(*(np.concatenate(values) for values in zip(*steps, strict=True)))
+
+
+def _joined(parts: _Patches, moments: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, _Patches]:
+    """Patches of the parts from each `first` on up to the next, and their moments."""
+    count = np.diff(first, append=len(parts.area))
+    total = np.add.reduceat(parts.area, first)
+    like = lambda weights, values: weights.reshape(-1, *[1] * (values.ndim - 1))
+    mean = lambda values: np.add.reduceat(values * like(parts.area, values), first) / like(total, values)
+    center, moments, normal = mean(parts.center), mean(moments), mean(parts.normal)
+    # A curved patch shows less of itself than its area, as a vector.
+    shown = np.linalg.norm(normal, axis=1)
+    normal, area = normal / shown[:, None], total * shown
+    whole = np.repeat(np.arange(len(first)), count)
+    off = ((parts.target - center[whole]) ** 2).sum(1)
+    nearest = np.lexsort((off, whole))[first]
+    turned = np.arccos(np.clip((parts.normal * normal[whole]).sum(1), -1, 1))
+    turn = np.maximum.reduceat(parts.turn + np.where(turned > 1e-3, turned, 0.0), first)
+    patches = _of_size(0.0, center, normal, moments, area, parts.owner[first], parts.target[nearest], first, count)
+    return moments, patches._replace(turn=turn)
+
+
+def _of_size(size: float, center, normal, moments, area, owner, target, first, count) -> _Patches:
+    """`moments` are means of the products of coordinates."""
+    two = frames(normal)[:, :2]
+    spread = np.einsum("nki,nij,nkj->nk", two, moments - center[:, :, None] * center[:, None], two)
+    # Four points at sqrt(2) times the deviations have the patch's second moments.
+    arms = two * np.sqrt(2 * np.maximum(spread, 0.0))[..., None]
+    size, flat = np.full(len(area), size), np.zeros(len(area))
+    return _Patches(size, center, normal, arms, area, flat, owner, target, first, count)
+
+
+def _with_images(scene: Scene, faces: EmittingFaces) -> EmittingFaces:
+    """And what is seen of them behind mirrors; positions in unfolded voxel coordinates."""
+    for number, axis in enumerate(unfolded_axes(scene)):
+        if axis.kind in ("lower", "upper"):
+            plane, flip = (0 if axis.kind == "lower" else axis.count), np.where(np.arange(3) == number, -1.0, 1.0)
+            position = faces.position * flip + np.where(flip < 0, 2.0 * plane, 0.0)
+            image = faces._replace(position=position, normal=faces.normal * flip)
+            faces = EmittingFaces(*(np.concatenate(both) for both in zip(faces, image, strict=True)))
+    return faces
+
+
+# Who looks at which
+
+
+def _arriving(
+    scene: Scene, patches: _Patches, surfaces: Surfaces, rows: np.ndarray, radiance: Float[Array, "C owners"]
+) -> tuple[Float[Array, "C n"], Float[np.ndarray, " n"]]:
+    """The irradiance of some elements, and what it would be without a medium, of radiance 1."""
+    still, unattenuated = _still(scene), []
+    position = (surfaces.position[rows] - scene.lattice.lower) / scene.lattice.spacing
+    normal, parts = surfaces.normal[rows], []
+    for begin in range(0, len(rows), _BLOCK):
+        facing = normal[begin : begin + _BLOCK]
+        start = position[begin : begin + _BLOCK] + CLEARANCE * facing
+        with jax.ensure_compile_time_eval():
+            pairs = _seen(still, patches, start, facing)
+        unattenuated.append(np.bincount(pairs.element, pairs.geometry, len(start)))
+        parts.append(_light(scene, patches, pairs, start, radiance))
+    return jnp.concatenate(parts, -1), np.concatenate(unattenuated)
+
+
+def _seen(scene: Scene, patches: _Patches, start: np.ndarray, facing: np.ndarray) -> _Pairs:
+    """Pairs of a block that see each other."""
+    pairs = _narrow(patches, start, facing)
+    if not scene.solids:
+        return pairs
+    total, found = np.bincount(pairs.element, pairs.geometry, len(start)), []
+    for number in range(_ROUNDS + 1):
+        if not len(pairs.element):
+            break
+        seen, surely = _looked_at(scene, patches, start, pairs)
+        surely |= (patches.count[pairs.patch] == 0) | (pairs.geometry < _MINOR * total[pairs.element]) | (number == _ROUNDS)
+        found.append(pairs.kept(surely & seen))
+        pairs = _bright(_faced(patches, start, facing, *_opened(patches, pairs.kept(~surely))), total)
+    return _Pairs.joined(found)
+
+
+def _looked_at(scene: Scene, patches: _Patches, start: np.ndarray, pairs: _Pairs) -> tuple[np.ndarray, np.ndarray]:
+    end = patches.target[pairs.patch] + CLEARANCE * patches.normal[pairs.patch]
+    radius = _RADIUS * patches.size[pairs.patch]
+    seen, surely = in_blocks(patch_visible, scene, (start[pairs.element], end, radius))
+    return np.asarray(seen) > 0, np.array(surely)
+
+
+def _narrow(patches: _Patches, start: np.ndarray, facing: np.ndarray) -> _Pairs:
+    """For each row the largest patches that are narrow enough, of those that lie before it and face it."""
+    (top,) = np.nonzero(patches.size == patches.size[-1])
+    pairs = np.repeat(np.arange(len(start)), len(top)), np.tile(top, len(start))
+    found = []
+    while len(pairs[0]):
+        element, patch = pairs
+        to = patches.center[patch] - start[element]
+        size, distance = patches.size[patch], np.sqrt((to**2).sum(-1))
+        ahead = (to * facing[element]).sum(-1) > -size
+        cosine = -(to * patches.normal[patch]).sum(-1) / distance
+        within = np.sin(np.minimum(patches.turn[patch], np.pi / 2)) + size / distance  # of its horizon
+        ahead &= cosine > -within
+        at_horizon = (patches.turn[patch] > 0) & (cosine < within)
+        wide = size > np.where(at_horizon, _WIDTH / _FINER, _WIDTH) * distance
+        wide &= patches.count[patch] > 0
+        found.append(_faced(patches, start, facing, element[ahead & ~wide], patch[ahead & ~wide]))
+        pairs = _opened(patches, _Pairs(element, patch, size).kept(ahead & wide))
+    pairs = _Pairs.joined(found)
+    return _bright(pairs, np.bincount(pairs.element, pairs.geometry, len(start)))
+
+
+def _opened(patches: _Patches, pairs: _Pairs) -> tuple[np.ndarray, np.ndarray]:
+    """The parts of each patch in its place."""
+    count = patches.count[pairs.patch]
+    within = np.arange(count.sum()) - np.repeat(np.cumsum(count) - count, count)
+    return np.repeat(pairs.element, count), np.repeat(patches.first[pairs.patch], count) + within
+
+
+def _faced(patches: _Patches, start: np.ndarray, facing: np.ndarray, element: np.ndarray, patch: np.ndarray) -> _Pairs:
+    mean, middle = 0.0, patches.center[patch] - start[element]
+    normal, arms, towards = patches.normal[patch], patches.arms[patch], facing[element]
+    for one, other in _FOUR:
+        to = middle + one * arms[:, 0] + other * arms[:, 1]
+        squared = np.maximum((to**2).sum(-1), 0.05**2)
+        cosines = np.maximum((to * towards).sum(-1), 0) * np.maximum(-(to * normal).sum(-1), 0)
+        mean = mean + cosines / squared**2 / len(_FOUR)
+    return _Pairs(element, patch, patches.area[patch] * mean)
+
+
+def _bright(pairs: _Pairs, total: np.ndarray) -> _Pairs:
+    return pairs.kept(pairs.geometry > _FAINT * total[pairs.element])
+
+
+def _light(scene: Scene, patches: _Patches, pairs: _Pairs, start: np.ndarray, radiance: Array) -> Float[Array, "C n"]:
+    # In few sizes, each compiled once: there are never quite as many pairs.
+    room = 1 << max(len(pairs.element) - 1, 1).bit_length()
+    padded = lambda values: np.concatenate([values, np.zeros(room - len(values), values.dtype)])
+    element, patch, geometry = (padded(values) for values in pairs)
+    passed = None
+    if scene.medium is not None:
+        passed = in_blocks(_passed, scene, (start[element], patches.target[patch]))
+    return _summed(geometry.astype(radiance.dtype), element, patches.owner[patch], passed, radiance, len(start))
+
+
+def _passed(scene: Scene, start: Array, end: Array) -> Float[Array, "n C"]:
+    length = jnp.sqrt(jnp.sum((end - start) ** 2, -1))
+    w = sloped((end - start) / jnp.where(length > 0, length, 1.0)[:, None])
+    return transmittance_between(scene, start, w, jnp.zeros_like(length), length)
+
+
+@eqx.filter_jit
+def _summed(geometry: Array, element: Array, owner: Array, passed: Array | None, radiance: Array, count: int) -> Array:
+    sent = geometry * radiance[:, owner]
+    sent = sent if passed is None else sent * passed.T
+    return jnp.zeros((radiance.shape[0], count), radiance.dtype).at[:, element].add(sent)
