@@ -20,9 +20,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import checks
-from .emitters import brighter_than, emitting_elements
+from .emitters import brighter_than, emitting_elements, point_light
 from .layout import Layout
-from .march import fill, transmittance
+from .march import fill
 from .operator import Light, Materials, Transport, make_transport
 from .partition import Partition
 from .patches import light_of_emitters, may_serve
@@ -31,7 +31,6 @@ from .prepare import Prepared
 from .quadrature import Quadrature
 from .scene import PointLight, Scene, Sky, Sun
 from .surfaces import Surfaces
-from .trace import visible
 from .transport.characteristic import Inflow
 from .volume_sources import VolumeSources, compact_sources, volume_light
 
@@ -180,24 +179,8 @@ def _from_volumes(scene: Scene, surfaces: Surfaces, sources: VolumeSources) -> L
 
 def _from_point(scene: Scene, surfaces: Surfaces, light: PointLight) -> Light:
     """First-flight light of a point light, at the elements and at the voxels' centres."""
-    spacing = scene.lattice.spacing
-    clearance = 2e-3 * spacing
-    normal = jnp.asarray(surfaces.normal, float)
-    start = jnp.asarray(surfaces.position, float) + clearance * normal
-    flux, to = _point_flux(scene, light, start)
-    cosine = jnp.einsum("ni,ni->n", to, normal) / jnp.maximum(jnp.linalg.norm(to, axis=1), 1e-30)
-    centers = jnp.asarray(scene.lattice.centers().reshape(-1, 3), float)
-    in_voxels, _ = _point_flux(scene, light, centers)
+    at_elements = point_light(scene, light, surfaces.position, surfaces.normal)
+    centers = scene.lattice.centers().reshape(-1, 3)
+    in_voxels = point_light(scene, light, centers, None, 0.5 * scene.lattice.spacing)
     in_voxels = in_voxels.reshape(-1, *scene.lattice.shape) * jnp.asarray(~surfaces.solid)
-    return Light(flux * jnp.maximum(cosine, 0.0) / jnp.pi, in_voxels / (4 * jnp.pi))
-
-
-def _point_flux(scene: Scene, light: PointLight, start: Float[Array, "n 3"]):
-    """I T V / r^2 at some points, and the vectors to the light."""
-    position = jnp.asarray(light.position, start.dtype)
-    to = position - start
-    ends = jnp.broadcast_to(position, start.shape)
-    squared = jnp.maximum(jnp.sum(to**2, -1), (0.5 * scene.lattice.spacing) ** 2)
-    reach = visible(scene, start, ends) * transmittance(scene, start, ends)
-    intensity = jnp.broadcast_to(light.intensity, (scene.bands,))
-    return intensity[:, None] * reach / squared, to
+    return Light(at_elements / jnp.pi, in_voxels / (4 * jnp.pi))

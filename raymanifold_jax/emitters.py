@@ -1,4 +1,4 @@
-"""Points on emitting surfaces, and light straight from them.
+"""Points on emitting surfaces and point lights, and light straight from them.
 
     E(x) = sum over points of  L A cos(theta) cos(theta') T V / r^2,
 
@@ -7,8 +7,8 @@ periodic sides send around without end is left to the sweeps.
 
 For readings there is a fixed number of points on emitters that cover little of the surfaces; `patches` serves the elements.
 
-Public: `EmitterPoints`, `small_emitters`, `emitter_light`; for `patches` `EmittingFaces`, `emitting_faces`, `emitted_by`,
-`brighter_than`, `emitting_elements`, `share_that_emits`, `SMALL`.
+Public: `EmitterPoints`, `small_emitters`, `emitter_light`, `point_light`; for `patches` `EmittingFaces`, `emitting_faces`,
+`emitted_by`, `brighter_than`, `emitting_elements`, `share_that_emits`, `SMALL`.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ from jaxtyping import Array, Bool, Float
 
 from . import checks
 from .march import transmittance
-from .scene import MIRROR, PERIODIC, Scene
+from .scene import MIRROR, PERIODIC, PointLight, Scene
 from .surfaces import Surfaces, patch_points
 from .texture import Texture
-from .trace import visible
+from .trace import share_that_passes, visible
+from .unfolding import in_blocks, unfolded_axes
 
 _POINTS = 576
 #: Emitters that cover less of the surfaces than this are sampled by points.
@@ -96,7 +97,8 @@ def emitting_faces(scene: Scene, surfaces: Surfaces, side: int) -> EmittingFaces
         inside = position[flush] - 0.02 * spacing * normal[flush]
         behind[flush] = np.asarray(scene.distance(jnp.asarray(inside))) < 0
     weight = np.where(behind, weight, 0.0)
-    weight[~weight.any(1), 0] = 1.0
+    alone = ~weight.any(1)  # with so small a face that none of its points is in the voxel
+    position[alone, 0], weight[alone, 0] = surfaces.position[emitters[alone]], 1.0
     keep = weight > 0
     area = surfaces.area[emitters][:, None] * weight / weight.sum(1, keepdims=True)
     of_each = lambda values: np.broadcast_to(values[:, None], keep.shape)[keep]
@@ -131,6 +133,39 @@ def emitter_light(
     spread = lambda a: jnp.asarray(np.concatenate([a, np.repeat(a[-1:], padded - count, 0)]), real).reshape(-1, block, 3)
     parts = [_pairs(scene, points, p, n) for p, n in zip(spread(position), spread(normal), strict=True)]
     return jnp.concatenate(parts, axis=-1)[..., :count]
+
+
+def point_light(
+    scene: Scene,
+    light: PointLight,
+    position: Float[np.ndarray, "n 3"],
+    normal: Float[np.ndarray, "n 3"] | None,
+    nearest: float = 1e-15,
+) -> Float[Array, "C n"]:
+    """Irradiance I cos(theta) T V / r^2 at surface points, without normals fluence; also by mirrors, as from images.
+
+    `nearest`: the least distance that counts.
+    """
+    spacing, lower = scene.lattice.spacing, np.asarray(scene.lattice.lower)
+    u = (position - lower) / spacing + (0.0 if normal is None else CLEARANCE * normal)
+    total = jnp.zeros((scene.bands, len(u)))
+    for image in _images(scene, (np.asarray(light.position, float) - lower) / spacing):
+        to = image - u
+        distance = np.maximum(np.sqrt((to**2).sum(-1)), nearest / spacing)
+        cosine = 1.0 if normal is None else np.maximum((to * normal).sum(-1), 0.0) / distance
+        reach = in_blocks(share_that_passes, scene, (u, np.broadcast_to(image, u.shape)))
+        total = total + reach.T * jnp.asarray(cosine / (distance * spacing) ** 2, total.dtype)
+    return jnp.broadcast_to(light.intensity, (scene.bands,))[:, None] * total
+
+
+def _images(scene: Scene, u: np.ndarray) -> np.ndarray:
+    """A point and what is seen of it behind mirrors, in unfolded voxel coordinates."""
+    points = u[None]
+    for number, axis in enumerate(unfolded_axes(scene)):
+        if axis.mirror is not None:
+            image = np.where(np.arange(3) == number, 2 * axis.mirror - points, points)
+            points = np.concatenate([points, image])
+    return points
 
 
 @eqx.filter_jit

@@ -25,14 +25,14 @@ from . import checks
 from .cubature import mean_of_rays
 from .direct import sky_radiance
 from .directions import gathering
-from .emitters import emitter_light, small_emitters
+from .emitters import emitter_light, point_light, small_emitters
 from .interpolation import ElementTable, element_table, interpolate_irradiance, slopes
 from .keep import keep
-from .march import fill, interpolate, march_between, transmittance, transmittance_between
-from .scene import MIRROR, OPEN, PERIODIC, SIDES, PointLight, Scene, Solid, Sun, Wall
+from .march import fill, interpolate, march_between, transmittance_between
+from .scene import MIRROR, OPEN, SIDES, PointLight, Scene, Solid, Sun, Wall
 from .solution import Solution
 from .texture import Texture, value_at
-from .trace import Hit, trace_rays, visible
+from .trace import Hit, trace_rays
 from .unfolding import in_blocks, sloped, to_voxel
 from .volume_sources import compact_sources, emission_of, volume_light, with_emission
 
@@ -143,7 +143,7 @@ def _gathered(solution: Solution, points: Any, normals: Any, number: int | None)
         total = total + volume_light(scene, compact, points, normals, rays=4 * (number or _fewest(normals))).T
     for light in scene.lights:
         if isinstance(light, PointLight):
-            total = total + _point_light(scene, light, points, normals)
+            total = total + point_light(scene, light, points, normals).T
     suns = (points,) if normals is None else (points, normals)
     return total + in_blocks(_sun_fluence if normals is None else _sun_irradiance, scene, suns)
 
@@ -314,20 +314,6 @@ def _sunlit(scene: Scene, points: Array, back: Array, towards: Array) -> Float[A
     enter = jnp.where(inside, hit.enter, 0.0) / spacing
     passed = transmittance_between(scene, to_voxel(scene, points), sloped(back), enter, jnp.maximum(reach, enter))
     return jnp.where(lit[:, None], passed, 0.0)
-
-
-def _point_light(scene: Scene, light: PointLight, points: Any, normals: Any) -> Float[Array, "n C"]:
-    """Irradiance I T V cos / r^2 from a point light; without normals fluence."""
-    to = np.asarray(light.position) - points
-    squared = np.maximum((to**2).sum(-1), 1e-30)
-    cosine = 1.0 if normals is None else np.maximum((to * normals).sum(-1), 0.0) / np.sqrt(squared)
-    ends = np.broadcast_to(np.asarray(light.position), points.shape)
-    reach = visible(scene, points, ends) * transmittance(scene, points, ends) * jnp.asarray(cosine / squared, float)
-    return reach.T * jnp.broadcast_to(light.intensity, (scene.bands,))
-
-
-def _has_images(scene: Scene) -> bool:
-    return any(side in (MIRROR, PERIODIC) for side in scene.boundary.sides)
 
 
 def _banded(scene: Scene, values: Float[Array, "n C"]) -> Float[Array, "n *bands"]:

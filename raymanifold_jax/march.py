@@ -7,7 +7,8 @@ With extinction s, scattering z, emission e and fluence phi, a segment of length
 Where a coefficient differs between voxels a segment ends at every voxel's faces, and each voxel's own values hold;
 else segments are equal and at most a voxel's side long. The fluence is interpolated, at the centre of what a segment sends.
 
-Public: `transmittance`, `march`, `fill`, `interpolate`; for blocks of rays `transmittance_between`, `march_between`.
+Public: `transmittance`, `march`, `fill`, `interpolate`; for blocks of rays `transmittance_unfolded`,
+`transmittance_between`, `march_between`.
 """
 
 from __future__ import annotations
@@ -146,6 +147,13 @@ def _transmittance(scene: Scene, start: Array, end: Array) -> Array:
     into, out_of = box_span(scene, o, w)
     into = jnp.clip(into, 0.0, length)
     return transmittance_between(scene, o, w, into, jnp.clip(out_of, into, length))
+
+
+def transmittance_unfolded(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"]) -> Float[Array, "n C"]:
+    """Transmittance between points in unfolded voxel coordinates, for one block."""
+    length = jnp.sqrt(jnp.sum((e - o) ** 2, -1))
+    w = sloped((e - o) / jnp.where(length > 0, length, 1.0)[:, None])
+    return transmittance_between(scene, o, w, jnp.zeros_like(length), length)
 
 
 def transmittance_between(scene: Scene, o: Array, w: Array, start: Array, stop: Array) -> Float[Array, "n C"]:

@@ -21,16 +21,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
+from scipy.spatial import cKDTree
 
 from . import checks
 from .directions import frames
 from .emitters import CLEARANCE, SMALL, EmittingFaces, emitting_faces, share_that_emits
-from .march import transmittance_between
+from .march import transmittance_unfolded
 from .scene import OPEN, Scene, Wall
-from .surfaces import Surfaces
+from .surfaces import Surfaces, patch_points
 from .trace import patch_visible
-from .unfolding import in_blocks, sloped, unfolded_axes
+from .unfolding import in_blocks, unfolded_axes
 
 _WIDTH = 0.35  # of a patch, at most, for its distance
 _FINER = 4.0  # times, where only a part of a curved patch can be seen
@@ -38,6 +39,9 @@ _ROUNDS = 5  # of taking parts instead, where not all of a patch may be seen
 _RADIUS = 0.8  # of a patch, for its size
 _FACES = 8  # along an element's side; half of it where there are many
 _MANY = 4096
+_NEXT = 2.0  # voxels: elements nearer to an emitter than this are looked at in more points than their middles
+_CONSERVING = 0.8, 1.25  # times, at most
+_POINTS = 3  # along their sides
 _BLOCK = 1 << 11  # elements at once
 _MINOR = 2e-3  # of an element's light: patches that send less are seen or not seen as a whole
 _FAINT = 1e-6  # of an element's light: no ray for less
@@ -86,7 +90,7 @@ def may_serve(scene: Scene, surfaces: Surfaces) -> bool:
     Not where most of the surfaces emit, and light is nearly even; nor where light goes around by mirrors or periodic sides
     without end.
     """
-    endless = any(np.isinf(axis.upper) for axis in unfolded_axes(scene))
+    endless = any(axis.endless for axis in unfolded_axes(scene))
     return not endless and 0 < share_that_emits(scene, surfaces) <= _MOST
 
 
@@ -107,12 +111,12 @@ def light_of_emitters(
     patches = _patches(scene, faces, side)
     if not checks.is_traced(known):
         rows = _sample(surfaces)
-        exact, _ = _arriving(_still(scene), patches, surfaces, rows, known[0])
+        exact, *_ = _arriving(_still(scene), patches, surfaces, rows, known[0])
         off = np.sqrt(np.mean((np.asarray(known[1])[:, rows] - np.asarray(exact)) ** 2, axis=1))
         if np.all(off <= _TOLERANCE * np.asarray(known[2])[:, rows].mean(1)):
             return None
-    found, unattenuated = _arriving(scene, patches, surfaces, np.arange(len(surfaces)), radiance)
-    return found * _conserving(scene, surfaces, faces, np.asarray(unattenuated))
+    found, unattenuated, near = _arriving(scene, patches, surfaces, np.arange(len(surfaces)), radiance)
+    return found * jnp.asarray(_conserving(scene, surfaces, faces, unattenuated, near), found.dtype)
 
 
 def _still(scene: Scene) -> Scene:
@@ -125,15 +129,16 @@ def _sample(surfaces: Surfaces) -> np.ndarray:
     return np.unique(np.searchsorted(share, (np.arange(_SAMPLE) + 0.5) / _SAMPLE))
 
 
-def _conserving(scene: Scene, surfaces: Surfaces, faces: EmittingFaces, unattenuated: np.ndarray) -> float:
-    """The factor by which all the power sent would arrive in vacuum (by about 0.2 % more or less at 16^3).
-
-    Elements are read at their middles, which counts a little too much where the light is near.
-    """
-    if not all(side is OPEN or isinstance(side, Wall) for side in scene.boundary.sides):
-        return 1.0  # some of it leaves through mirrors
-    received = unattenuated @ surfaces.area
-    return float(np.clip(np.pi * faces.area.sum() / received, 0.95, 1.05)) if received > 0 else 1.0
+def _conserving(
+    scene: Scene, surfaces: Surfaces, faces: EmittingFaces, unattenuated: np.ndarray, near: np.ndarray
+) -> Float[np.ndarray, " E"]:
+    """Factors by which all the power sent would arrive in vacuum: of the elements next to emitters, the least exact."""
+    factor = np.ones(len(surfaces))
+    received = unattenuated * surfaces.area
+    if near.any() and all(side is OPEN or isinstance(side, Wall) for side in scene.boundary.sides):
+        missing = np.pi * faces.area.sum() - received.sum()
+        factor[near] = np.clip(1 + missing / received[near].sum(), *_CONSERVING)
+    return factor  # with mirrors, some of it leaves through them
 
 
 # The patches
@@ -201,9 +206,9 @@ def _of_size(size: float, center, normal, moments, area, owner, target, first, c
 def _with_images(scene: Scene, faces: EmittingFaces) -> EmittingFaces:
     """And what is seen of them behind mirrors; positions in unfolded voxel coordinates."""
     for number, axis in enumerate(unfolded_axes(scene)):
-        if axis.kind in ("lower", "upper"):
-            plane, flip = (0 if axis.kind == "lower" else axis.count), np.where(np.arange(3) == number, -1.0, 1.0)
-            position = faces.position * flip + np.where(flip < 0, 2.0 * plane, 0.0)
+        if axis.mirror is not None:
+            flip = np.where(np.arange(3) == number, -1.0, 1.0)
+            position = faces.position * flip + np.where(flip < 0, 2.0 * axis.mirror, 0.0)
             image = faces._replace(position=position, normal=faces.normal * flip)
             faces = EmittingFaces(*(np.concatenate(both) for both in zip(faces, image, strict=True)))
     return faces
@@ -214,19 +219,44 @@ def _with_images(scene: Scene, faces: EmittingFaces) -> EmittingFaces:
 
 def _arriving(
     scene: Scene, patches: _Patches, surfaces: Surfaces, rows: np.ndarray, radiance: Float[Array, "C owners"]
-) -> tuple[Float[Array, "C n"], Float[np.ndarray, " n"]]:
-    """The irradiance of some elements, and what it would be without a medium, of radiance 1."""
-    still, unattenuated = _still(scene), []
-    position = (surfaces.position[rows] - scene.lattice.lower) / scene.lattice.spacing
-    normal, parts = surfaces.normal[rows], []
-    for begin in range(0, len(rows), _BLOCK):
-        facing = normal[begin : begin + _BLOCK]
+) -> tuple[Float[Array, "C n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """The mean irradiance of some elements; what it would be without a medium, of radiance 1; which are next to emitters."""
+    still, parts, unattenuated = _still(scene), [], []
+    receiver, position, weight = _receivers(scene, patches, surfaces, rows)
+    normal = surfaces.normal[rows][receiver]
+    for begin in range(0, len(receiver), _BLOCK):
+        facing, share = (values[begin : begin + _BLOCK] for values in (normal, weight))
         start = position[begin : begin + _BLOCK] + CLEARANCE * facing
         with jax.ensure_compile_time_eval():
             pairs = _seen(still, patches, start, facing)
-        unattenuated.append(np.bincount(pairs.element, pairs.geometry, len(start)))
-        parts.append(_light(scene, patches, pairs, start, radiance))
-    return jnp.concatenate(parts, -1), np.concatenate(unattenuated)
+        unattenuated.append(share * np.bincount(pairs.element, pairs.geometry, len(start)))
+        parts.append(_light(scene, patches, pairs, start, radiance) * jnp.asarray(share, radiance.dtype))
+    found = jnp.zeros((radiance.shape[0], len(rows)), radiance.dtype).at[:, receiver].add(jnp.concatenate(parts, -1))
+    near = np.bincount(receiver, minlength=len(rows)) > 1
+    return found, np.bincount(receiver, np.concatenate(unattenuated), len(rows)), near
+
+
+def _receivers(scene: Scene, patches: _Patches, surfaces: Surfaces, rows: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Points for the elements: which one's, where (in voxels), and its share. One each, more of those next to emitters."""
+    position = (surfaces.position[rows] - scene.lattice.lower) / scene.lattice.spacing
+    ends = patches.center[patches.count == 0]
+    distance, nearest = cKDTree(ends).query(position, distance_upper_bound=_NEXT)
+    close = np.isfinite(distance)
+    ahead = np.einsum("ni,ni->n", ends[nearest[close]] - position[close], surfaces.normal[rows[close]])
+    close[close] = ahead > 0.1 * distance[close]  # not the emitter's own
+    near, far = np.nonzero(close)[0], np.nonzero(~close)[0]
+    normal = surfaces.normal[rows[near]]
+    points, weight = patch_points(normal, surfaces.offset[rows[near]], _POINTS)
+    points = points + (surfaces.voxel[rows[near]] + 0.5)[:, None]
+    if scene.solids and len(near):  # what another solid covers of a face is none of it
+        outside = scene.lattice.lower + (points + 0.02 * normal[:, None]) * scene.lattice.spacing
+        weight = np.where(np.asarray(_still(scene).distance(jnp.asarray(outside))) > 0, weight, 0.0)
+    alone = ~weight.any(1)
+    points[alone, 0], weight[alone, 0] = position[near[alone]], 1.0
+    kept = weight > 0
+    share = (weight / weight.sum(1, keepdims=True))[kept]
+    receiver = np.concatenate([far, np.broadcast_to(near[:, None], kept.shape)[kept]])
+    return receiver, np.concatenate([position[far], points[kept]]), np.concatenate([np.ones(len(far)), share])
 
 
 def _seen(scene: Scene, patches: _Patches, start: np.ndarray, facing: np.ndarray) -> _Pairs:
@@ -303,14 +333,8 @@ def _light(scene: Scene, patches: _Patches, pairs: _Pairs, start: np.ndarray, ra
     element, patch, geometry = (padded(values) for values in pairs)
     passed = None
     if scene.medium is not None:
-        passed = in_blocks(_passed, scene, (start[element], patches.target[patch]))
+        passed = in_blocks(transmittance_unfolded, scene, (start[element], patches.target[patch]))
     return _summed(geometry.astype(radiance.dtype), element, patches.owner[patch], passed, radiance, len(start))
-
-
-def _passed(scene: Scene, start: Array, end: Array) -> Float[Array, "n C"]:
-    length = jnp.sqrt(jnp.sum((end - start) ** 2, -1))
-    w = sloped((end - start) / jnp.where(length > 0, length, 1.0)[:, None])
-    return transmittance_between(scene, start, w, jnp.zeros_like(length), length)
 
 
 @eqx.filter_jit

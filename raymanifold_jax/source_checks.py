@@ -10,6 +10,7 @@ import numpy as np
 from . import checks
 from .scene import OPEN, SIDES, PointLight, Scene, Sun
 from .surfaces import Surfaces
+from .unfolding import unfolded_axes
 
 
 def check_sources(scene: Scene, surfaces: Surfaces) -> None:
@@ -33,6 +34,10 @@ def check_sources(scene: Scene, surfaces: Surfaces) -> None:
 
 
 def _check_point(scene: Scene, name: str, position: np.ndarray) -> None:
+    if any(axis.endless for axis in unfolded_axes(scene)):
+        expected = "open sides, walls, or one mirror along an axis"
+        advice = "there it has images without end: use a small solid with an emission, or rm.Sun"
+        checks.fail(name, "a point light between periodic sides or two mirrors", expected, advice)
     if not bool(np.all(scene.lattice.contains(position[None]))):
         checks.fail(
             name,

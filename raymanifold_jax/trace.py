@@ -9,8 +9,8 @@ be looked at from outside through its near walls. A solid that touches a side fr
 The functions take arrays in scene units, compute in JAX's default float type, and work on any number of rays. They are not
 made to be differentiated: what is in front of what has no gradient here.
 
-Public: `Hit`, `first_hit`, `visible`; for blocks of rays `trace_rays`, `visible_unfolded`, `patch_visible`; and `march`,
-`transmittance` from `march`.
+Public: `Hit`, `first_hit`, `visible`; for blocks of rays `trace_rays`, `visible_unfolded`,
+`share_that_passes`, `patch_visible`; and `march`, `transmittance` from `march`.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .march import march as march
 from .march import transmittance as transmittance
+from .march import transmittance_unfolded
 from .scene import OPEN, Scene
 from .unfolding import Axis, box_span, fold, in_blocks, sloped, to_scene, to_voxel, unfolded_axes
 
@@ -186,6 +187,11 @@ def _visible(scene: Scene, start: Array, end: Array) -> Array:
 def visible_unfolded(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """`visible` for one block, between points in unfolded voxel coordinates."""
     return _line_of_sight(scene, o, e, None)[0]
+
+
+def share_that_passes(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"]) -> Float[Array, "n C"]:
+    """Transmittance, and 0 behind solids, between points in unfolded voxel coordinates; for one block."""
+    return transmittance_unfolded(scene, o, e) * visible_unfolded(scene, o, e)[:, None]
 
 
 def patch_visible(

@@ -64,6 +64,15 @@ class Axis(NamedTuple):
             return u, jnp.ones_like(u)
         return n - jnp.abs(n - u), jnp.where(u > n, -1.0, 1.0).astype(u.dtype)
 
+    @property
+    def mirror(self) -> int | None:
+        """Where the one mirror is, behind which everything has one image."""
+        return {"lower": 0, "upper": self.count}.get(self.kind)
+
+    @property
+    def endless(self) -> bool:
+        return math.isinf(self.upper)
+
     def to_fold(self, u: Array, w: Array) -> Array:
         """Distance to the next plane between images, along a ray with component w."""
         plane = jnp.where(w > 0, jnp.floor(u / self.count) + 1, jnp.ceil(u / self.count) - 1) * self.count

@@ -32,11 +32,11 @@ from scipy import ndimage
 
 from . import checks
 from .directions import gathering
-from .march import march_between, transmittance_between
+from .march import march_between
 from .scene import Scene
 from .surfaces import Surfaces
-from .trace import trace_rays, visible_unfolded
-from .unfolding import Axis, in_blocks, sloped, to_scene, unfolded_axes
+from .trace import share_that_passes, trace_rays
+from .unfolding import Axis, in_blocks, to_scene, unfolded_axes
 
 Numbers = np.ndarray | Array
 
@@ -79,7 +79,7 @@ def compact_sources(scene: Scene, surfaces: Surfaces, blocks: int = 1) -> Volume
         return None
     values, axes = emission_of(scene), unfolded_axes(scene)
     known = lax.stop_gradient(values)
-    if checks.is_traced(known) or not all(math.isfinite(axis.upper) for axis in axes):
+    if checks.is_traced(known) or any(axis.endless for axis in axes):
         return None
     emission = np.where(surfaces.solid, 0.0, np.asarray(known, np.float64))
     if not emission.any():
@@ -107,7 +107,7 @@ def _numpy(values: Any) -> Any:
 
 def _part(axes: tuple[Axis, ...], emission: Numbers, box: tuple[slice, ...], blocks: int) -> Part:
     ends = [(s.start, s.stop) for s in box]
-    mirrors = [_mirror(axis) for axis in axes]
+    mirrors = [axis.mirror for axis in axes]
     touches = [m is not None and m in e for m, e in zip(mirrors, ends, strict=True)]
     whole = [(1 + t) * (b - a) for t, (a, b) in zip(touches, ends, strict=True)]
     # Two blocks along the whole of it, of which one is an image's where it touches a mirror.
@@ -138,11 +138,6 @@ def _part(axes: tuple[Axis, ...], emission: Numbers, box: tuple[slice, ...], blo
             lower, upper = np.concatenate([lower, swapped[0]]), np.concatenate([upper, swapped[1]])
             position, strength = np.concatenate([position, flip(position)]), xp.concatenate([strength, strength], -1)
     return Part(emission, lower, upper, side, position, strength)
-
-
-def _mirror(axis: Axis) -> int | None:
-    """Where an axis is folded."""
-    return {"lower": 0, "upper": axis.count}.get(axis.kind)
 
 
 def _block_points(emission: Numbers, block: tuple[slice, ...]) -> tuple[np.ndarray, Numbers]:
@@ -197,7 +192,7 @@ def _from_points(scene: Scene, part: Part, u: np.ndarray, normal: np.ndarray | N
         if normal is not None:
             geometry *= np.maximum(np.einsum("nmi,ni->nm", to, normal[i : i + block]), 0) / np.sqrt(squared)
         starts = np.broadcast_to(here[:, None], to.shape).reshape(-1, 3)
-        passed = in_blocks(_passed, scene, (starts, np.broadcast_to(part.points, to.shape).reshape(-1, 3)))
+        passed = in_blocks(share_that_passes, scene, (starts, np.broadcast_to(part.points, to.shape).reshape(-1, 3)))
         found.append(_summed(passed.reshape(*to.shape[:2], -1), jnp.asarray(geometry, passed.dtype), part.power))
     return jnp.concatenate(found, -1) if found else jnp.zeros((scene.bands, 0))
 
@@ -205,14 +200,6 @@ def _from_points(scene: Scene, part: Part, u: np.ndarray, normal: np.ndarray | N
 @eqx.filter_jit
 def _summed(passed: Array, geometry: Array, power: Numbers) -> Array:
     return jnp.einsum("nmc,nm,cm->cn", passed, geometry, jnp.asarray(power, passed.dtype))
-
-
-def _passed(scene: Scene, start: Array, end: Array) -> Float[Array, "n C"]:
-    """Transmittance, and 0 behind solids, between points in unfolded voxel coordinates."""
-    length = jnp.sqrt(jnp.sum((end - start) ** 2, -1))
-    w = sloped((end - start) / jnp.where(length > 0, length, 1.0)[:, None])
-    through = transmittance_between(scene, start, w, jnp.zeros_like(length), length)
-    return through * visible_unfolded(scene, start, end)[:, None]
 
 
 def _from_directions(scene: Scene, emission: Any, u: np.ndarray, normal: np.ndarray | None, rays: int) -> Float[Array, "C n"]:
