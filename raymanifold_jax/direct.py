@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import checks
-from .emitters import brighter_than, emitting_elements, point_light
+from .emitters import CLEARANCE, brighter_than, emitting_elements, point_light
 from .layout import Layout
 from .march import fill
 from .operator import Light, Materials, Transport, make_transport
@@ -179,7 +179,8 @@ def _from_volumes(scene: Scene, surfaces: Surfaces, sources: VolumeSources) -> L
 
 def _from_point(scene: Scene, surfaces: Surfaces, light: PointLight) -> Light:
     """First-flight light of a point light, at the elements and at the voxels' centres."""
-    at_elements = point_light(scene, light, surfaces.position, surfaces.normal)
+    start = surfaces.position + CLEARANCE * scene.lattice.spacing * surfaces.normal
+    at_elements = point_light(scene, light, start, surfaces.normal)
     centers = scene.lattice.centers().reshape(-1, 3)
     in_voxels = point_light(scene, light, centers, None, 0.5 * scene.lattice.spacing)
     in_voxels = in_voxels.reshape(-1, *scene.lattice.shape) * jnp.asarray(~surfaces.solid)

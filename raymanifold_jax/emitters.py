@@ -142,12 +142,12 @@ def point_light(
     normal: Float[np.ndarray, "n 3"] | None,
     nearest: float = 1e-15,
 ) -> Float[Array, "C n"]:
-    """Irradiance I cos(theta) T V / r^2 at surface points, without normals fluence; also by mirrors, as from images.
+    """Irradiance I cos(theta) T V / r^2 at points just off surfaces, without normals fluence; also by mirrors, as from images.
 
     `nearest`: the least distance that counts.
     """
     spacing, lower = scene.lattice.spacing, np.asarray(scene.lattice.lower)
-    u = (position - lower) / spacing + (0.0 if normal is None else CLEARANCE * normal)
+    u = (position - lower) / spacing
     total = jnp.zeros((scene.bands, len(u)))
     for image in _images(scene, (np.asarray(light.position, float) - lower) / spacing):
         to = image - u
