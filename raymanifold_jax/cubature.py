@@ -27,7 +27,6 @@ _SIDE = 32  # cells of a square, along a side
 _CUT = 4
 _RIM = 3  # cells around a square that are looked at as well
 _WAYS = ((1, 0), (0, 1), (1, 1), (1, -1))
-_CUT_OFF = 0.1  # of a cell's step, in those beside it
 #: Cells of a point to be cut at once, at most, and how often; then again for the smaller ones.
 _CUTS = ((512, 3), (1024, 1))
 _GOLDEN = (np.sqrt(5) - 1) / 2
@@ -152,10 +151,10 @@ def _steps(wide: np.ndarray, scale: np.ndarray) -> np.ndarray:
         bends = [np.abs(after - before) for before, after in itertools.pairwise(rises)]
         steps = np.maximum(steps, np.minimum(bends[1], np.maximum(bends[0], bends[2])))
     steps = steps.max(-1)
-    # An edge may cut off so little of a cell beside these that no ray tells.
+    # Cells beside a step's are cut as well: were it left to what each happened to see, means would be biased.
     at = lambda i, j: steps[:, 1 + i : size - 1 + i, 1 + j : size - 1 + j]
     beside = np.max([at(i, j) for way in _WAYS for i, j in (way, (-way[0], -way[1]))], axis=0)
-    return np.maximum(at(0, 0), _CUT_OFF * beside)
+    return np.maximum(at(0, 0), beside)
 
 
 def _worst(variance: np.ndarray, point: np.ndarray, allowed: float, most: int) -> tuple[np.ndarray, ...]:

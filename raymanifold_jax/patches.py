@@ -132,12 +132,15 @@ def _sample(surfaces: Surfaces) -> np.ndarray:
 def _conserving(
     scene: Scene, surfaces: Surfaces, faces: EmittingFaces, unattenuated: np.ndarray, near: np.ndarray
 ) -> Float[np.ndarray, " E"]:
-    """Factors by which all the power sent would arrive in vacuum: of the elements next to emitters, the least exact."""
-    factor = np.ones(len(surfaces))
-    received = unattenuated * surfaces.area
-    if near.any() and all(side is OPEN or isinstance(side, Wall) for side in scene.boundary.sides):
+    """Factors by which all the power sent would arrive in vacuum: of the elements next to emitters, the least exact.
+
+    Of all elements where none is: read at their middles, they have .2 % too much at 16^3.
+    """
+    factor, received = np.ones(len(surfaces)), unattenuated * surfaces.area
+    least_exact = near if near.any() else np.ones(len(surfaces), bool)
+    if received[least_exact].sum() > 0 and all(side is OPEN or isinstance(side, Wall) for side in scene.boundary.sides):
         missing = np.pi * faces.area.sum() - received.sum()
-        factor[near] = np.clip(1 + missing / received[near].sum(), *_CONSERVING)
+        factor[least_exact] = np.clip(1 + missing / received[least_exact].sum(), *_CONSERVING)
     return factor  # with mirrors, some of it leaves through them
 
 

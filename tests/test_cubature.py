@@ -34,9 +34,10 @@ def test_even_light_takes_no_more_rays(x64):
 
 def test_smooth_light(x64):
     # Around n the mean of (n . w)^2 by the cosine is 1/2; over the sphere that of w_z^2 is 1/3 and of w_z 0.
+    # Within two of the standard errors asked for.
     for number, normal in enumerate(UP):
         found, _ = mean(lambda w, n=normal: (w @ n) ** 2, UP)
-        assert found[number] == pytest.approx(0.5, rel=1e-3)
+        assert found[number] == pytest.approx(0.5, rel=2e-3)
     assert mean(lambda w: w[:, 2] ** 2, None)[0] == pytest.approx(1 / 3, rel=1e-3)
     assert mean(lambda w: w[:, 2], None)[0] == pytest.approx(0.0, abs=5e-4)
     assert mean(lambda w: w[:, 0] + w[:, 1], None)[0] == pytest.approx(0.0, abs=5e-4)
