@@ -14,7 +14,7 @@ Public: `light_of_emitters`, `may_serve`.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from . import checks
 from .directions import frames
@@ -152,7 +152,7 @@ def _patches(scene: Scene, faces: EmittingFaces, side: int) -> _Patches:
     spacing = scene.lattice.spacing
     faces = faces._replace(position=(faces.position - scene.lattice.lower) / spacing, area=faces.area / spacing**2)
     faces = _with_images(scene, faces)
-    size = 1 / side
+    size, middle = 1 / side, np.asarray(scene.lattice.shape) / 2
     two = frames(faces.normal)[:, :2]
     moments = np.einsum("nki,nkj->nij", two, two) * (size**2 / 12) + faces.position[:, :, None] * faces.position[:, None]
     none = np.zeros(len(faces.area), int)
@@ -160,8 +160,10 @@ def _patches(scene: Scene, faces: EmittingFaces, side: int) -> _Patches:
     code = (np.round(2 * faces.normal).astype(int) + 2) @ np.array([25, 5, 1])
     while size < 2 * max(scene.lattice.shape) and len(steps[-1].area) > 1:
         size *= 2
-        # Off the planes of the lattice, for rounding not to part what lies in one.
-        cell = np.floor((steps[-1].center + 0.37 / side) / size).astype(int)
+        # Counted from the middle either way, so that a turned scene has the turned patches.
+        away = np.round(steps[-1].center - middle, 6)
+        cell = np.floor(np.abs(away) / size).astype(int)
+        cell = np.where(away < 0, -1 - cell, cell)
         cell -= cell.min(0)
         key = np.ravel_multi_index(tuple(cell.T), tuple(cell.max(0) + 1)) * _CODES + code
         key = key * (int(faces.owner.max()) + 1) + steps[-1].owner
@@ -192,7 +194,8 @@ def _joined(parts: _Patches, moments: np.ndarray, first: np.ndarray) -> tuple[np
     nearest = np.lexsort((off, whole))[first]
     turned = np.arccos(np.clip((parts.normal * normal[whole]).sum(1), -1, 1))
     turn = np.maximum.reduceat(parts.turn + np.where(turned > 1e-3, turned, 0.0), first)
-    patches = _of_size(0.0, center, normal, moments, area, parts.owner[first], parts.target[nearest], first, count)
+    target = np.where((turn > 0)[:, None], parts.target[nearest], center)
+    patches = _of_size(0.0, center, normal, moments, area, parts.owner[first], target, first, count)
     return moments, patches._replace(turn=turn)
 
 
@@ -202,8 +205,8 @@ def _of_size(size: float, center, normal, moments, area, owner, target, first, c
     spread = np.einsum("nki,nij,nkj->nk", two, moments - center[:, :, None] * center[:, None], two)
     # Four points at sqrt(2) times the deviations have the patch's second moments.
     arms = two * np.sqrt(2 * np.maximum(spread, 0.0))[..., None]
-    size, flat = np.full(len(area), size), np.zeros(len(area))
-    return _Patches(size, center, normal, arms, area, flat, owner, target, first, count)
+    sizes, flat = np.full(len(area), size), np.zeros(len(area))
+    return _Patches(sizes, center, normal, arms, area, flat, owner, target, first, count)
 
 
 def _with_images(scene: Scene, faces: EmittingFaces) -> EmittingFaces:
@@ -243,7 +246,7 @@ def _receivers(scene: Scene, patches: _Patches, surfaces: Surfaces, rows: np.nda
     """Points for the elements: which one's, where (in voxels), and its share. One each, more of those next to emitters."""
     position = (surfaces.position[rows] - scene.lattice.lower) / scene.lattice.spacing
     ends = patches.center[patches.count == 0]
-    distance, nearest = cKDTree(ends).query(position, distance_upper_bound=_NEXT)
+    distance, nearest = (np.asarray(found) for found in KDTree(ends).query(position, distance_upper_bound=_NEXT))
     close = np.isfinite(distance)
     ahead = np.einsum("ni,ni->n", ends[nearest[close]] - position[close], surfaces.normal[rows[close]])
     close[close] = ahead > 0.1 * distance[close]  # not the emitter's own
@@ -332,8 +335,7 @@ def _bright(pairs: _Pairs, total: np.ndarray) -> _Pairs:
 def _light(scene: Scene, patches: _Patches, pairs: _Pairs, start: np.ndarray, radiance: Array) -> Float[Array, "C n"]:
     # In few sizes, each compiled once: there are never quite as many pairs.
     room = 1 << max(len(pairs.element) - 1, 1).bit_length()
-    padded = lambda values: np.concatenate([values, np.zeros(room - len(values), values.dtype)])
-    element, patch, geometry = (padded(values) for values in pairs)
+    element, patch, geometry = (np.pad(np.asarray(values), (0, room - len(values))) for values in pairs)
     passed = None
     if scene.medium is not None:
         passed = in_blocks(transmittance_unfolded, scene, (start[element], patches.target[patch]))
@@ -341,7 +343,7 @@ def _light(scene: Scene, patches: _Patches, pairs: _Pairs, start: np.ndarray, ra
 
 
 @eqx.filter_jit
-def _summed(geometry: Array, element: Array, owner: Array, passed: Array | None, radiance: Array, count: int) -> Array:
+def _summed(geometry: Any, element: Any, owner: Any, passed: Array | None, radiance: Array, count: int) -> Array:
     sent = geometry * radiance[:, owner]
     sent = sent if passed is None else sent * passed.T
     return jnp.zeros((radiance.shape[0], count), radiance.dtype).at[:, element].add(sent)

@@ -83,7 +83,7 @@ class Solution(eqx.Module):
     - `error_bound`: certified: no radiosity, and no medium source times pi, is further than this from the exact solution of
       the discrete problem (in radiosity units; rounding apart). inf where no bound is known, nan under `jit` and `vmap`.
     - `sweeps`: applications of the transport operator on the full lattice. `history`: the largest residual after each
-      sweep, in radiosity units. `ending`: "converged", "sweep limit", "stagnated", "diverged", "no bound" or, with `bounces`,
+      iterate, in radiosity units. `ending`: "converged", "sweep limit", "stagnated", "diverged", "no bound" or, with `bounces`,
       "as asked"; `result`: the same in a sentence, with advice; `converged`: whether the bound met the tolerance; `solver`:
       which one it was.
     - `rounding`: what the float type's rounding in the sweeps may add to the error, in radiosity units; an estimate.

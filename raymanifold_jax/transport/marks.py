@@ -32,7 +32,8 @@ def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinat
     for axis, (own, reads) in enumerate(zip(ordinates, layout.reads, strict=True)):
         order = AXES[axis]
         geometry = planes[0], *(planes[1 + a] for a in order)
-        shape, padded = layout.padded_along(axis), tuple(layout.pad[a] > 0 for a in order)
+        a, u, v = order
+        shape, padded = layout.padded_along(axis), (layout.pad[a] > 0, layout.pad[u] > 0, layout.pad[v] > 0)
         voxel = jnp.unravel_index(layout.cell, layout.padded)
         home = jnp.stack([voxel[a] for a in order])
         face = layout.face[jnp.array([0, *(1 + a for a in order)])]
