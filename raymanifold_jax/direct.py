@@ -71,7 +71,9 @@ def first_flight(
         around = jnp.zeros(scene.bands) if sky is None else jnp.mean(sky_radiance(scene, quadrature.directions), axis=1)
         excess = brighter_than(scene, around)
         emits = np.isin(np.arange(len(surfaces)), emitting_elements(scene, surfaces))
-        by_sweep = _swept(transport, Light(excess[:, surfaces.material] * emits, dark.voxels), None).elements
+        alone = sky is None and (glow is None or not checks.may_differ_from_zero(glow))
+        sent = Light(excess[:, surfaces.material] * emits, dark.voxels)
+        by_sweep = swept.elements if alone else _swept(transport, sent, None).elements
         found = light_of_emitters(scene, surfaces, excess, jnp.pi * by_sweep, jnp.pi * swept.elements)
         if found is None:
             return swept

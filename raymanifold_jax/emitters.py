@@ -27,7 +27,7 @@ from .scene import MIRROR, PERIODIC, PointLight, Scene
 from .surfaces import Surfaces, patch_points
 from .texture import Texture
 from .trace import share_that_passes, visible
-from .unfolding import in_blocks, unfolded_axes
+from .unfolding import in_blocks, mirror_images
 
 _POINTS = 576
 #: Emitters that cover less of the surfaces than this are sampled by points.
@@ -149,23 +149,14 @@ def point_light(
     spacing, lower = scene.lattice.spacing, np.asarray(scene.lattice.lower)
     u = (position - lower) / spacing
     total = jnp.zeros((scene.bands, len(u)))
-    for image in _images(scene, (np.asarray(light.position, float) - lower) / spacing):
+    for sign, shift in mirror_images(scene):
+        image = sign * (np.asarray(light.position, float) - lower) / spacing + shift
         to = image - u
         distance = np.maximum(np.sqrt((to**2).sum(-1)), nearest / spacing)
         cosine = 1.0 if normal is None else np.maximum((to * normal).sum(-1), 0.0) / distance
         reach = in_blocks(share_that_passes, scene, (u, np.broadcast_to(image, u.shape)))
         total = total + reach.T * jnp.asarray(cosine / (distance * spacing) ** 2, total.dtype)
     return jnp.broadcast_to(light.intensity, (scene.bands,))[:, None] * total
-
-
-def _images(scene: Scene, u: np.ndarray) -> np.ndarray:
-    """A point and what is seen of it behind mirrors, in unfolded voxel coordinates."""
-    points = u[None]
-    for number, axis in enumerate(unfolded_axes(scene)):
-        if axis.mirror is not None:
-            image = np.where(np.arange(3) == number, 2 * axis.mirror - points, points)
-            points = np.concatenate([points, image])
-    return points
 
 
 @eqx.filter_jit

@@ -31,7 +31,7 @@ from .march import transmittance_unfolded
 from .scene import OPEN, Scene, Wall
 from .surfaces import Surfaces, patch_points
 from .trace import patch_visible
-from .unfolding import in_blocks, unfolded_axes
+from .unfolding import in_blocks, mirror_images, unfolded_axes
 
 _WIDTH = 0.35  # of a patch, at most, for its distance
 _FINER = 4.0  # times, where only a part of a curved patch can be seen
@@ -211,13 +211,11 @@ def _of_size(size: float, center, normal, moments, area, owner, target, first, c
 
 def _with_images(scene: Scene, faces: EmittingFaces) -> EmittingFaces:
     """And what is seen of them behind mirrors; positions in unfolded voxel coordinates."""
-    for number, axis in enumerate(unfolded_axes(scene)):
-        if axis.mirror is not None:
-            flip = np.where(np.arange(3) == number, -1.0, 1.0)
-            position = faces.position * flip + np.where(flip < 0, 2.0 * axis.mirror, 0.0)
-            image = faces._replace(position=position, normal=faces.normal * flip)
-            faces = EmittingFaces(*(np.concatenate(both) for both in zip(faces, image, strict=True)))
-    return faces
+    images = [
+        faces._replace(position=faces.position * sign + shift, normal=faces.normal * sign)
+        for sign, shift in mirror_images(scene)
+    ]
+    return EmittingFaces(*(np.concatenate(parts) for parts in zip(*images, strict=True)))
 
 
 # Who looks at which

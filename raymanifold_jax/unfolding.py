@@ -7,7 +7,7 @@ back where the scene is asked about it. With n voxels along an axis,
 
 and mirrors on both sides repeat after 2 n.
 
-For this package: `Axis`, `unfolded_axes`, `fold`, `to_voxel`, `to_scene`, `sloped`, `box_span`, `in_blocks`.
+For this package: `Axis`, `unfolded_axes`, `mirror_images`, `fold`, `to_voxel`, `to_scene`, `sloped`, `box_span`, `in_blocks`.
 """
 
 from __future__ import annotations
@@ -91,6 +91,16 @@ def unfolded_axes(scene: Scene) -> tuple[Axis, ...]:
             kind = "lower" if below else "upper" if above else "plain"
             axes.append(Axis(n, kind, -n if below else 0, 2 * n if above else n))
     return tuple(axes)
+
+
+def mirror_images(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Where mirrors show what is at u, in unfolded voxel coordinates: at sign * u + shift; itself first."""
+    images = [(np.ones(3), np.zeros(3))]
+    for number, axis in enumerate(unfolded_axes(scene)):
+        if axis.mirror is not None:
+            here = np.arange(3) == number
+            images += [(np.where(here, -1, sign), np.where(here, 2 * axis.mirror, shift)) for sign, shift in images]
+    return images
 
 
 def fold(axes: tuple[Axis, ...], u: Float[Array, "n 3"]) -> tuple[Array, Array]:
