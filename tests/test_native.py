@@ -45,6 +45,8 @@ _AROUND = rm.Boundary(x=rm.PERIODIC, y=rm.MIRROR, z=(rm.Wall(0.7), rm.OPEN))
 _TORUS = rm.Boundary(x=rm.OPEN, y=rm.PERIODIC, z=rm.PERIODIC)
 _SCENES = {
     "vacuum": lambda: _box(None, _ROOM),
+    "vacuum around an axis, mirrored": lambda: _box(None, _AROUND, (5, 6, 9)),
+    "vacuum around two axes": lambda: _box(None, _TORUS, (9, 5, 4)),
     "thin fog": lambda: _box(rm.Medium(scattering=0.5, absorption=0.1), _ROOM),
     "thick fog": lambda: _box(rm.Medium(scattering=8.0, absorption=0.5), _ROOM),
     "thin uneven fog": lambda: _box(rm.Medium(scattering=_uneven((9, 9, 9), 0.2), absorption=0.0), _ROOM),
@@ -93,7 +95,7 @@ def _close(found, expected, free: np.ndarray) -> None:
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * float(jnp.abs(b).max()))
 
 
-_QUICK = {"vacuum", "thin fog", "thick uneven fog in two bands", "around an axis, mirrored"}
+_QUICK = {"vacuum", "vacuum around two axes", "thin fog", "thick uneven fog in two bands", "around an axis, mirrored"}
 _EACH = pytest.mark.parametrize("name", [n if n in _QUICK else pytest.param(n, marks=pytest.mark.slow) for n in _SCENES])
 
 
@@ -130,7 +132,7 @@ def test_without_fluence():
     _close(elements, derivative._sweep_program(manner, *given)[0], case.free)
 
 
-@pytest.mark.parametrize("boundary", [_ROOM, _AROUND], ids=["room", "around an axis, mirrored"])
+@pytest.mark.parametrize("boundary", [_ROOM, _AROUND, _TORUS], ids=["room", "around an axis, mirrored", "around two axes"])
 def test_links(boundary, monkeypatch):
     case = _Case(_box(None, boundary))
     found = find_links(case.layout, case.transport.ordinates)

@@ -123,8 +123,12 @@ def sweep(
 
         def run(part: np.ndarray):
             sums = [np.zeros((bands, len(r.cell))) for r in readers]
-            voxels, work = np.zeros((line.shape[0], bands, line.area), real), _work(code, line, min(how.rows, len(part)), real)
-            code.forwards(part, line.ways, planes, cut, line.ghosts, hits, probes, light, how, work, sums[0], sums[1], voxels)
+            voxels, directions = np.zeros((line.shape[0], bands, line.area), real), min(how.rows, len(part))
+            known = part, line.ways, planes, cut, line.ghosts, hits, probes, light, how
+            if volume is None:
+                code.in_vacuum(*known, _standing(code, line, directions, real), *sums, voxels)
+            else:
+                code.forwards(*known, _work(code, line, directions, real), *sums, voxels)
             return sums, voxels
 
         for sums, voxels in on_cores(run, line.parts):
@@ -215,7 +219,7 @@ def views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray)
             most = (0, 0)
             for _ in range(2):  # how long the lists must be, and what is in them
                 seen, filled = [np.zeros(len(r.cell), int) for r in readers], lists(most)
-                work = _work(code, line, min(how.rows, len(part)), np.dtype(np.int32))
+                work = _standing(code, line, min(how.rows, len(part)), np.dtype(np.int32))
                 of_hits, of_probes = ((s, *f) for s, f in zip(seen, filled, strict=True))
                 there = listed[0], listed[1], of_hits, of_probes
                 code.views(part, line.ways, planes, cut, line.ghosts, hits, probes, how, work, *there)
@@ -292,8 +296,24 @@ def _work(code, line: _Axis, directions: int, real) -> machine_code.Work:
     return code.Work(
         rows=np.zeros((directions + 4, size + 2 * width), real), nowhere=np.zeros(size, real), asked=np.zeros((3, size), real),
         here=np.zeros((12, int(np.diff(line.cut.first).max())), real), own=np.zeros(directions, int), free=np.zeros(4, int),
-        point=np.zeros(3), whole=np.zeros(3), form=np.zeros(8), way=_segments(code),
+        point=np.zeros(3), whole=np.zeros(3), form=np.zeros((code.ROWS + 1) * code.BLOCK), picked=np.zeros(_most(line), np.int32),
+        at=np.zeros(code.BLOCK, np.int32), way=_segments(code),
     )  # fmt: skip
+
+
+def _standing(code, line: _Axis, directions: int, real) -> machine_code.Standing:
+    most = _most(line)
+    return code.Standing(
+        rows=np.zeros((directions, line.area), real), shift=np.zeros(directions, int), nowhere=np.zeros(1, real),
+        hits=np.zeros((3, most), real), probes=np.zeros((3, most), real), picked=np.zeros((2, most), np.int32),
+        here=np.zeros((3, int(np.diff(line.cut.first).max())), real), form=np.zeros((code.ROWS + 1) * code.BLOCK),
+        at=np.zeros(code.BLOCK, np.int32), way=_segments(code),
+    )  # fmt: skip
+
+
+def _most(line: _Axis) -> int:
+    """Readers of one kind in a plane, at most, and at least one."""
+    return max(1, *(int(np.diff(r.first[r.runs]).max(initial=0)) for r in (line.hits, line.probes)))
 
 
 def _arguments(code, layout: Layout, line: _Axis, medium: _Medium, axis: int) -> tuple:
@@ -382,8 +402,9 @@ def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
     at = lambda image: (image, number[home[image]])
     chunk, place = np.nonzero(np.asarray(own.weight) != 0)
     ways = _ways(code, own, chunk, place)
+    marked = lambda bits, wanted: (ways, chunk, place, np.asarray(bits), wanted)
     hits, probes = (
-        _readers(code, reads, _marks(bits, chunk, place, wanted), number, surface, height * width)
+        _readers(code, reads, marked(bits, wanted), number, surface, cut)
         for reads, bits, wanted in zip(layout.reads[axis], (own.hit_bits, own.probe_bits), (1, 0), strict=True)
     )
     # A core takes directions from all over, sorted by sense: the two senses meet planes in opposite order.
@@ -410,38 +431,50 @@ def _cells(code, chosen: np.ndarray, plane, image: np.ndarray | None, real: np.d
     )
 
 
-def _readers(code, reads: Reads, marks: np.ndarray, number: np.ndarray, surface: np.ndarray, area: int) -> machine_code.Readers:
-    """Reads in runs of the same plane and surface; `marks` [N, M] tells who reads in which direction."""
+def _readers(
+    code, reads: Reads, marked: tuple, number: np.ndarray, surface: np.ndarray, cells: machine_code.Cells
+) -> machine_code.Readers:
+    """Reads in runs of the same plane and surface; `marked` tells who reads in which direction."""
     plane = np.repeat(np.arange(len(reads.first_tile) - 1), np.diff(np.asarray(reads.first_tile)) * reads.tile)
     used = np.nonzero(np.any([np.asarray(n)[: len(plane)] != 0 for n in reads.plane[1:]], axis=0))[0]  # the rest only pads
     plane, cell = plane[used], np.asarray(reads.cell)[used].astype(int)
-    where = plane * area + cell
+    where = plane * surface.shape[1] + cell
     cut = np.where(surface.ravel()[where], number[where], -1)
-    face = np.array([np.asarray(values)[used] for values in (*reads.plane, reads.height)], float)
+    face = np.array([np.asarray(values)[used] for values in (*reads.plane, reads.height)])
     keys = np.array([*face, cut, plane])
     order = np.lexsort(keys)
-    keys = keys[:, order]
-    begins = np.nonzero(np.concatenate([[len(order) > 0], np.any(keys[:, 1:] != keys[:, :-1], axis=0)]))[0]
+    keys, cut = keys[:, order], cut[order]
+    changes = np.any(keys[:, 1:] != keys[:, :-1], axis=0) | (cut[1:] >= 0)
+    begins = np.nonzero(np.concatenate([[len(order) > 0], changes]))[0]
     count = len(reads.first_tile) - 1
+    planes = np.zeros((4, len(order)), face.dtype)
+    planes[0] = 1.0
+    planes[:, cut >= 0] = cells.plane[:, cut[cut >= 0]]
     return code.Readers(
         runs=np.searchsorted(plane[order][begins], np.arange(count + 1)),
         first=np.append(begins, len(order)),
-        face=np.ascontiguousarray(face[:4, order][:, begins]),
-        height=face[4, order][begins],
-        cut=cut[order][begins],
+        face=face[:4, order],
+        plane=planes,
+        height=face[4, order],
+        cut=cut,
         cell=cell[order].astype(np.int32),
         element=np.asarray(reads.element)[used][order].astype(int),
-        bits=np.packbits(marks[:, used][:, order], axis=1, bitorder="little"),
+        bits=_packed_marks(code, marked, used[order], face[:4, order]),
         even=np.zeros((1, 0), bool),
         depth=np.zeros((1, 0)),
         extinction=np.zeros((1, 0)),
     )
 
 
-def _marks(bits: Array, chunk: np.ndarray, place: np.ndarray, wanted: int) -> np.ndarray:
-    """Whether each direction's bit is the one that is wanted, of each read: [N, M]."""
-    words = np.asarray(bits)[chunk, place >> 5]
-    return (words >> (place & 31).astype(np.uint32)[:, None] & 1) == wanted
+def _packed_marks(code, marked: tuple, image: np.ndarray, face: np.ndarray) -> np.ndarray:
+    """Who reads in each direction, as bits [N, M / 8], of the readers that are `image` in the layout."""
+    ways, chunk, place, words, wanted = marked
+    bits = np.zeros((len(chunk), -(-len(image) // 8)), np.uint8)
+    known = *_frozen((ways, words, np.uint32(wanted), chunk, place, image.astype(np.int32), face)), bits
+    parts = [np.arange(core, len(chunk), count_cores()) for core in range(count_cores())]
+    for _ in on_cores(lambda part: code.pack(part, *known), [p for p in parts if len(p)]):
+        pass
+    return bits
 
 
 def _ways(code, own: Ordinates, chunk: np.ndarray, place: np.ndarray) -> machine_code.Ways:

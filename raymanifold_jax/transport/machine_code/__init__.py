@@ -9,19 +9,22 @@ Segments of no length are left out; where the extinction is the same all over a 
 Numbers of whole planes are of the fields' own type; those of elements are worked out in 64 bits.
 
 numba keeps what it has compiled, by the time stamp of the file that holds the outermost function: after a change in another
-file here, touch `evolution.py`, `links.py` and `marks.py`.
+file here, touch `evolution.py`, `vacuum.py` and `marks.py`.
 
-Public: `forwards`, `backwards`, `views`, `mark`, and the tuples that they take.
+Public: `forwards`, `backwards`, `in_vacuum`, `views`, `mark`, `pack`, and the tuples that they take.
 """
 
-from .arguments import EVEN, PATCHY, UNEVEN, Around, Cells, Elements, Light, Manner, Planes, Readers, Segments, Ways, Work
+from .arguments import EVEN, PATCHY, UNEVEN, Around, Cells, Elements, Light, Manner, Planes, Readers, Segments, Standing, Ways, Work
 from .evolution import backwards, forwards
-from .links import views
-from .marks import mark
+from .marks import mark, pack
+from .readers import BLOCK, ROWS
+from .vacuum import in_vacuum, views
 
 __all__ = [
+    "BLOCK",
     "EVEN",
     "PATCHY",
+    "ROWS",
     "UNEVEN",
     "Around",
     "Cells",
@@ -31,10 +34,13 @@ __all__ = [
     "Planes",
     "Readers",
     "Segments",
+    "Standing",
     "Ways",
     "Work",
     "backwards",
     "forwards",
+    "in_vacuum",
     "mark",
+    "pack",
     "views",
 ]

@@ -42,16 +42,20 @@ class Cells(NamedTuple):
 
 
 class Readers(NamedTuple):
-    """Elements that read voxels (see `layout.Reads`), plane by plane, in runs that have the same surface."""
+    """Elements that read voxels (see `layout.Reads`), plane by plane, in runs that have the same surface.
+
+    Those in CUT voxels, whose surfaces are hardly ever the same, are runs of their own.
+    """
 
     runs: Any  # [K + 1] runs of plane k: runs[k] to runs[k + 1]
     first: Any  # [R + 1] readers of run r: first[r] to first[r + 1]
-    face: Any  # [4, R]
-    height: Any  # [R]
-    cut: Any  # [R] number of the voxel among the CUT ones, -1 where it is none
+    face: Any  # [4, M] offset and normal of their surface
+    plane: Any  # [4, M] and of that in their voxel; (1, 0, 0, 0) where there is none
+    height: Any  # [M]
+    cut: Any  # [M] number of the voxel among the CUT ones, -1 where it is none
     cell: Any  # [M]
     element: Any  # [M]
-    bits: Any  # [N, M / 8] whether it reads in a direction
+    bits: Any  # [N, M / 8] whether it reads in a direction, which comes from before it
     even: Any  # [C, R] whether all of the run have the extinction `depth`
     depth: Any  # [C, R]
     extinction: Any  # [C, M] of the voxel
@@ -122,5 +126,22 @@ class Work(NamedTuple):
     free: Any  # [4] rows that hold none
     point: Any  # [3]
     whole: Any  # [3]
-    form: Any  # [8]
+    form: Any  # [(ROWS + 1) * BLOCK]
+    picked: Any  # [most readers of a plane, or 1]
+    at: Any  # [BLOCK]
+    way: Any  # Segments
+
+
+class Standing(NamedTuple):
+    """A core's own memory where rays keep their places (see `vacuum`), of any content."""
+
+    rows: Any  # [rows, P] rays
+    shift: Any  # [rows] from where a ray is kept to the voxel it is in
+    nowhere: Any  # [1]
+    hits: Any  # [3, most of a plane] rays before each segment, as those read them that are `picked`
+    probes: Any
+    picked: Any  # [2, most of a plane] hits and probes that read in a direction
+    here: Any  # [3, most CUT voxels in a plane]
+    form: Any  # [(ROWS + 1) * BLOCK]
+    at: Any  # [BLOCK]
     way: Any  # Segments

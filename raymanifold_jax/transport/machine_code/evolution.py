@@ -1,4 +1,4 @@
-"""A coordinate evolution along one axis, and its transpose."""
+"""A coordinate evolution along one axis through a medium, and the transpose, with a medium or without."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def forwards(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wor
     """One coordinate evolution in the `chosen` directions along one axis; adds to the sums [C, M], [C, M2] and [K, C, P]."""
     count, bands, size = planes.even.shape[0], planes.even.shape[1], planes.height * planes.width
     margin = planes.width
-    rows, way, here, own, free, form = work.rows, work.way, work.here, work.own, work.free, work.form
+    rows, way, here, own, free = work.rows, work.way, work.here, work.own, work.free
     most = len(own)
     for first in range(0, len(chosen), most):
         batch = chosen[first : first + most]
@@ -73,7 +73,7 @@ def forwards(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wor
                             from_ghosts(ghosts, k, c, n, ways, after, margin, light)
                             join_ends(after, margin, size)
                         if reading:
-                            there = length, rows, margin, light, cut, planes.spacing, manner, form
+                            there = length, margin, light, planes.spacing, manner, work
                             read(False, hits, ways, n, k, c, segments, way, *there, at_hits)
                             read(True, probes, ways, n, k, c, segments, way, *there, at_probes)
                         own[b], free[segments - 1] = free[segments - 1], own[b]
@@ -97,7 +97,7 @@ def backwards(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_
     """The transpose of `forwards`: adds to `back` what weights of its three sums ask of what was sent."""
     count, bands, size = planes.even.shape[0], planes.even.shape[1], planes.height * planes.width
     margin = planes.width
-    rows, way, here, own, free, form = work.rows, work.way, work.here, work.own, work.free, work.form
+    rows, way, here, own, free = work.rows, work.way, work.here, work.own, work.free
     asked, most = work.asked, len(own)
     for first in range(0, len(chosen), most):
         batch = chosen[first : first + most]
@@ -121,7 +121,7 @@ def backwards(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_
                             for i in range(size):
                                 asked[number, i] = 0
                         if reading:
-                            there = length, asked, back, here, cut, planes.spacing, manner, form
+                            there = length, back, cut.first[k], planes.spacing, manner, work
                             ask(False, hits, ways, n, k, c, segments, way, *there, of_hits)
                             ask(True, probes, ways, n, k, c, segments, way, *there, of_probes)
                         for number in range(segments - 1, -1, -1):

@@ -1,7 +1,8 @@
-"""Which directions have rays that arrive at an element in its own voxel (see `transport.marks`)."""
+"""Which directions have rays that arrive at an element in its own voxel (see `transport.marks`), and who reads in which."""
 
 from __future__ import annotations
 
+import numpy as np
 from numba.extending import register_jitable
 
 from ..characteristic import _BEHIND
@@ -55,3 +56,19 @@ def mark(chosen, ways, around, elements, chunk, place, way, bits):
                         found, clean = True, clean and _clean(around, elements, i, k, number, sense, way)
                 if found and clean:
                     bits[g, word, i] |= bit
+
+
+@compiled
+def pack(chosen, ways, words, wanted, chunk, place, image, face, bits):
+    """Set the bits [N, M / 8] of readers in the `chosen` directions: where those of their `image` in `words` [G, words, I] are
+    `wanted`, and light comes from before their `face`."""
+    for n in chosen:
+        of_word, by = words[chunk[n], place[n] >> 5], np.uint32(place[n] & 31)
+        a, u, v = ways.toward[n, 0], ways.toward[n, 1], ways.toward[n, 2]
+        for byte in range(bits.shape[1]):
+            marks = np.uint8(0)
+            for m in range(8 * byte, min(8 * byte + 8, len(image))):
+                reads = ((of_word[image[m]] >> by) & np.uint32(1)) == wanted
+                reads &= face[1, m] * a + face[2, m] * u + face[3, m] * v < 0
+                marks |= np.uint8(reads) << np.uint8(m & 7)
+            bits[n, byte] = marks

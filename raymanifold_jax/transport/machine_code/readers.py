@@ -1,8 +1,9 @@
 """What elements read of the rays, and the transpose.
 
 It is linear in the rays before each of three segments (0 to 2), the voxel's source (3), its slopes (4 to 6) and its exitance
-(7): the *form* of an element, the same for all of a run. These loops make no views of arrays, which would take longer than what
-they do.
+(7): the *form* of an element. Runs of elements with the same surface and extinction share one. Of all others, those that read
+in a direction are picked, and their forms worked out `BLOCK` at a time, without branches, in one array: row r of it begins
+at r * BLOCK.
 """
 
 from __future__ import annotations
@@ -12,7 +13,19 @@ from numba.extending import register_jitable
 
 from ..characteristic import _BEHIND, _ONWARD
 from ..slopes import THIN
-from .paths import attenuation, compiled
+from .paths import bend_of, compiled, exp, mean_of
+
+BLOCK = 128
+#: Rows of the array that follow the form: what it is multiplied by, how many hits or how much of paths, the elements' surfaces
+#: and those in their voxels (offset and normal), and what else their forms depend on.
+FACTOR, _TOTAL, _FACE, _PLANE, _HEIGHT, _DEPTH, ROWS = 8, 9, 10, 14, 18, 19, 20
+# Unsigned, because numba looks whether others are negative, and does not vectorise then.
+_row = lambda number: np.uintp(number * BLOCK)
+_O0, _O1, _O2, _O3, _O7 = _row(0), _row(1), _row(2), _row(3), _row(7)
+_A, _U, _V = _row(4), _row(5), _row(6)
+_OF, _OT, _OH, _OD = _row(FACTOR), _row(_TOTAL), _row(_HEIGHT), _row(_DEPTH)
+_F0, _F1, _F2, _F3 = (_row(_FACE + i) for i in range(4))
+_P0, _P1, _P2, _P3 = (_row(_PLANE + i) for i in range(4))
 
 
 @register_jitable
@@ -32,111 +45,272 @@ def marked(bits, n, m):
 
 
 @register_jitable
-def _onto_path(form, sloped, weight, way, number, start, path, of_middle, of_rise):
-    """Light of a linear source on a path: so much of it in the middle, and of its rise."""
-    form[3] += weight * of_middle
-    if sloped:
-        for a in range(3):
-            middle = way.begin[number, a] + way.step[a] * (start + path / 2)
-            form[4 + a] += weight * (of_middle * middle + of_rise * way.step[a] * path)
+def faces_away(readers, m, ways, n):
+    return tilt(readers.face, m, ways.toward[n, 0], ways.toward[n, 1], ways.toward[n, 2]) >= 0
 
 
 @register_jitable
-def scaled(form, factor):
-    for i in range(8):
-        form[i] *= factor
-
-
-@register_jitable
-def _form_of_hits(readers, r, extinction, count, way, length, manner, form):
-    """Mean radiance of the rays that arrive at the element in its own voxel; False where none does."""
-    hits = 0
-    scaled(form, 0.0)
-    for number in range(count):
-        share = way.share[number]
-        g0, g1 = height_of(readers.face, r, way.begin, number), height_of(readers.face, r, way.end, number)
-        if g0 >= -_BEHIND and g1 < 0 and share > 0 and g0 > g1:
-            hits += 1
-            path, kept = share * min(max(g0 / max(g0 - g1, 1e-9), 0.0), 1.0), 1.0
-            if manner.medium:
-                tau = extinction * length * path
-                kept, _, bend = attenuation(tau, manner.thin, manner.limit)
-                _onto_path(form, manner.sloped, 1.0, way, number, 0.0, path, 1 - kept, tau * bend)
-            form[number] += kept
-    if hits > 1:
-        scaled(form, 1 / hits)
-    return hits > 0
-
-
-@register_jitable
-def _onward_time(readers, r, way, number, middle, depth):
-    """The time from the middle of a path on to the element's plane; `depth` is the optical depth of a voxel's side."""
-    towards = -tilt(readers.face, r, way.step[0], way.step[1], way.step[2])
-    height = readers.height[r] + tilt(readers.face, r, way.begin[number, 0], way.begin[number, 1], way.begin[number, 2])
-    onward = min(max((height - middle * towards) / max(towards, 1e-6), 0.0), _ONWARD)
-    return onward * min(max(depth / THIN - 1, 0.0), 1.0)
-
-
-@register_jitable
-def _form_of_paths(readers, r, extinction, count, way, length, spacing, cells, manner, form):
-    """Mean radiance of the free paths in the voxel; False where there are none."""
-    j, paths = readers.cut[r], 0.0
-    scaled(form, 0.0)
-    for number in range(count):
-        start, free, behind, share = 0.0, way.share[number], False, way.share[number]
-        if j >= 0:
-            g0 = height_of(cells.plane, j, way.begin, number)
-            slope = tilt(cells.plane, j, way.step[0], way.step[1], way.step[2])
-            behind = g0 < 0
-            free = max(min(max(g0, g0 + share * slope) / (abs(slope) + 1e-20), share), 0.0)
-            start = share - free if behind else 0.0
-        if free <= 0:
-            continue
-        paths += free
-        weight = free
-        if manner.medium:
-            if manner.onward:
-                onward = _onward_time(readers, r, way, number, start + free / 2, extinction * spacing)
-                if onward > 0:
-                    tau = extinction * length * onward
-                    kept, _, bend = attenuation(tau, manner.thin, manner.limit)
-                    _onto_path(form, manner.sloped, weight, way, number, start + free / 2, onward, 1 - kept, tau * bend)
-                    weight *= kept
-            _, mean, bend = attenuation(extinction * length * free, manner.thin, manner.limit)
-            _onto_path(form, manner.sloped, weight, way, number, start, free, 1 - mean, -bend)
-            weight *= mean
-        form[7 if behind else number] += weight
-    scaled(form, 1 / max(paths, 1e-6))
-    return paths > 1e-6
-
-
-@register_jitable
-def form_of(paths, readers, r, extinction, count, way, length, spacing, cells, manner, form):
-    if paths:
-        return _form_of_paths(readers, r, extinction, count, way, length, spacing, cells, manner, form)
-    return _form_of_hits(readers, r, extinction, count, way, length, manner, form)
-
-
-@register_jitable
-def _read_one(c, k, m, j, cell, count, form, rows, way, margin, light, manner, sums):
-    total = 0.0
-    for number in range(count):
-        total += form[number] * rows[way.row[number], margin - way.move[number] + cell]
-    if manner.medium:
-        total += form[3] * light.source[k, c, cell]
-    if manner.sloped:
-        for a in range(3):
-            total += form[4 + a] * light.slopes[a][k, c, cell]
-    if form[7] != 0:
-        total += form[7] * light.cut[c, j]
-    sums[c, m] += total
+def attenuations(tau, limit):
+    """As `paths.attenuation`, without a branch."""
+    thin, thick, kept = tau < limit, max(tau, limit), exp(-tau)
+    mean = mean_of(tau) if thin else (1 - kept) / thick
+    bend = bend_of(tau) if thin else ((1 + kept) / 2 - mean) / thick
+    return 1 - tau * mean if thin else kept, mean, bend
 
 
 @compiled
-def _add_term(sums, bits, n, cell, first, last, factor, values):
+def pick_marked(bits, n, first, last, picked):
+    """Write those of readers `first` to `last` that read in a direction to `picked`, and return how many."""
+    count = 0
+    for byte in range(first >> 3, (last + 7) >> 3):
+        marks = bits[n, byte]
+        if marks == 0:
+            continue
+        for m in range(max(8 * byte, first), min(8 * byte + 8, last)):
+            picked[count] = m  # without a branch: a processor cannot guess the marks
+            count += (marks >> np.uint8(m & 7)) & np.uint8(1)
+    return count
+
+
+@compiled
+def take(to, values, picked):
+    for i in range(len(picked)):
+        to[i] = values[picked[i]]
+
+
+@compiled
+def _load(readers, ways, n, picked, form):
+    """The surfaces of readers, and the cosine and the weight of a direction."""
+    size, w = len(picked), ways.weight[n]
+    a, u, v = ways.toward[n, 0], ways.toward[n, 1], ways.toward[n, 2]
+    for r in range(4):
+        take(form[(_FACE + r) * BLOCK : (_FACE + r + 1) * BLOCK], readers.face[r], picked)
+        take(form[(_PLANE + r) * BLOCK : (_PLANE + r + 1) * BLOCK], readers.plane[r], picked)
+    for i in range(size):
+        j = np.uintp(i)
+        form[j + _OF] = -w * (form[j + _F1] * a + form[j + _F2] * u + form[j + _F3] * v)
+        form[j + _OT] = 0.0
+    for r in range(8):
+        of_row = np.uintp(r) * np.uintp(BLOCK)
+        for i in range(size):
+            form[np.uintp(i) + of_row] = 0.0
+
+
+@compiled
+def _hits_in_vacuum(form, size, to, b, e):
+    b0, b1, b2, e0, e1, e2 = b[0], b[1], b[2], e[0], e[1], e[2]
+    for i in range(size):
+        j = np.uintp(i)
+        g0 = form[j + _F0] + form[j + _F1] * b0 + form[j + _F2] * b1 + form[j + _F3] * b2
+        g1 = form[j + _F0] + form[j + _F1] * e0 + form[j + _F2] * e1 + form[j + _F3] * e2
+        hit = 1.0 if (g0 >= -_BEHIND) & (g1 < 0) & (g0 > g1) else 0.0
+        form[j + _OT] += hit
+        form[j + to] = hit
+
+
+@compiled
+def _hits(form, size, to, b, e, s, share, length, limit, sloped):
+    b0, b1, b2, e0, e1, e2 = b[0], b[1], b[2], e[0], e[1], e[2]
+    s0, s1, s2 = s[0], s[1], s[2]
+    for i in range(size):
+        j = np.uintp(i)
+        g0 = form[j + _F0] + form[j + _F1] * b0 + form[j + _F2] * b1 + form[j + _F3] * b2
+        g1 = form[j + _F0] + form[j + _F1] * e0 + form[j + _F2] * e1 + form[j + _F3] * e2
+        hit = 1.0 if (g0 >= -_BEHIND) & (g1 < 0) & (g0 > g1) else 0.0
+        path = share * min(max(g0 / max(g0 - g1, 1e-9), 0.0), 1.0)
+        tau = form[j + _OD] * length * path
+        kept, _, bend = attenuations(tau, limit)
+        form[j + _OT] += hit
+        form[j + to] = hit * kept
+        middle, rise, half = hit * (1 - kept), hit * tau * bend * path, path / 2
+        form[j + _O3] += middle
+        if sloped:
+            form[j + _A] += middle * (b0 + s0 * half) + rise * s0
+            form[j + _U] += middle * (b1 + s1 * half) + rise * s1
+            form[j + _V] += middle * (b2 + s2 * half) + rise * s2
+
+
+@compiled
+def _paths_in_vacuum(form, size, to, b, s, share):
+    b0, b1, b2, s0, s1, s2 = b[0], b[1], b[2], s[0], s[1], s[2]
+    for i in range(size):
+        j = np.uintp(i)
+        g0 = form[j + _P0] + form[j + _P1] * b0 + form[j + _P2] * b1 + form[j + _P3] * b2
+        slope = form[j + _P1] * s0 + form[j + _P2] * s1 + form[j + _P3] * s2
+        free = max(min(max(g0, g0 + share * slope) / (abs(slope) + 1e-20), share), 0.0)
+        behind = 1.0 if g0 < 0 else 0.0
+        form[j + _OT] += free
+        form[j + _O7] += behind * free
+        form[j + to] = (1 - behind) * free
+
+
+@compiled
+def _paths(form, size, to, b, s, share, length, spacing, limit, onward, sloped):
+    b0, b1, b2, s0, s1, s2 = b[0], b[1], b[2], s[0], s[1], s[2]
+    for i in range(size):
+        j = np.uintp(i)
+        g0 = form[j + _P0] + form[j + _P1] * b0 + form[j + _P2] * b1 + form[j + _P3] * b2
+        slope = form[j + _P1] * s0 + form[j + _P2] * s1 + form[j + _P3] * s2
+        free = max(min(max(g0, g0 + share * slope) / (abs(slope) + 1e-20), share), 0.0)
+        behind = 1.0 if g0 < 0 else 0.0
+        start, extinction, weight = behind * (share - free), form[j + _OD], free
+        if onward:
+            # From the middle of the path on to the element's plane.
+            towards = -(form[j + _F1] * s0 + form[j + _F2] * s1 + form[j + _F3] * s2)
+            height = form[j + _OH] + form[j + _F1] * b0 + form[j + _F2] * b1 + form[j + _F3] * b2
+            time = min(max((height - (start + free / 2) * towards) / max(towards, 1e-6), 0.0), _ONWARD)
+            time *= min(max(extinction * spacing / THIN - 1, 0.0), 1.0)
+            tau = extinction * length * time
+            kept, _, bend = attenuations(tau, limit)
+            middle, rise, at = weight * (1 - kept), weight * tau * bend * time, start + free / 2 + time / 2
+            form[j + _O3] += middle
+            if sloped:
+                form[j + _A] += middle * (b0 + s0 * at) + rise * s0
+                form[j + _U] += middle * (b1 + s1 * at) + rise * s1
+                form[j + _V] += middle * (b2 + s2 * at) + rise * s2
+            weight *= kept
+        _, mean, bend = attenuations(extinction * length * free, limit)
+        middle, rise, at = weight * (1 - mean), -weight * bend * free, start + free / 2
+        form[j + _O3] += middle
+        if sloped:
+            form[j + _A] += middle * (b0 + s0 * at) + rise * s0
+            form[j + _U] += middle * (b1 + s1 * at) + rise * s1
+            form[j + _V] += middle * (b2 + s2 * at) + rise * s2
+        weight *= mean
+        form[j + _OT] += free
+        form[j + _O7] += behind * weight
+        form[j + to] = (1 - behind) * weight
+
+
+@compiled
+def forms_of(paths, readers, ways, n, c, picked, depth, count, way, length, spacing, manner, form):
+    """The forms of the `picked` readers, times cosine and weight of the direction.
+
+    As the mean of free `paths` or else of hits. All have the extinction `depth`, or each its own if that is negative.
+    """
+    size = len(picked)
+    _load(readers, ways, n, picked, form)
+    if manner.medium:
+        take(form[_HEIGHT * BLOCK : (_HEIGHT + 1) * BLOCK], readers.height, picked)
+        of_each = form[_DEPTH * BLOCK : (_DEPTH + 1) * BLOCK]
+        if depth < 0:
+            take(of_each, readers.extinction[c], picked)
+        else:
+            for i in range(size):
+                of_each[i] = depth
+    for number in range(count):
+        share, to = way.share[number], np.uintp(number) * np.uintp(BLOCK)
+        if share <= 0:
+            continue
+        b, e, s = way.begin[number], way.end[number], way.step
+        if paths and manner.medium:
+            # Programs of their own, without branches.
+            if manner.onward and manner.sloped:
+                _paths(form, size, to, b, s, share, length, spacing, manner.limit, True, True)
+            elif manner.onward:
+                _paths(form, size, to, b, s, share, length, spacing, manner.limit, True, False)
+            elif manner.sloped:
+                _paths(form, size, to, b, s, share, length, spacing, manner.limit, False, True)
+            else:
+                _paths(form, size, to, b, s, share, length, spacing, manner.limit, False, False)
+        elif paths:
+            _paths_in_vacuum(form, size, to, b, s, share)
+        elif manner.medium:
+            _hits(form, size, to, b, e, s, share, length, manner.limit, manner.sloped)
+        else:
+            _hits_in_vacuum(form, size, to, b, e)
+    _finish(form, size, 1e-6)
+
+
+@compiled
+def _finish(form, size, least):
+    for i in range(size):
+        j = np.uintp(i)
+        total = form[j + _OT]
+        form[j + _OF] = form[j + _OF] / max(total, least) if total > least else 0.0
+    for r in range(8):
+        of_row = np.uintp(r) * np.uintp(BLOCK)
+        for i in range(size):
+            j = np.uintp(i)
+            form[j + of_row] *= form[j + _OF]
+
+
+@register_jitable
+def shared(readers, r, c, manner):
+    """Whether all of a run have the same form, but for the marks. Those in CUT voxels are runs of their own."""
+    return readers.first[r + 1] > readers.first[r] + 1 and (not manner.medium or readers.even[c, r])
+
+
+@register_jitable
+def next_block(readers, r, end, c, manner):
+    """The run behind those from r on that do not share forms."""
+    while r < end and not shared(readers, r, c, manner):
+        r += 1
+    return r
+
+
+@compiled
+def add_term(sums, bits, n, cell, first, last, factor, values):
     """Without a branch: a processor cannot guess the marks."""
     for m in range(first, last):
         sums[m] += factor * marked(bits, n, m) * values[cell[m]]
+
+
+@compiled
+def add_each(total, form, values, at):
+    for i in range(len(at)):
+        total[i] += form[i] * values[at[i]]
+
+
+@compiled
+def _read_block(readers, c, k, picked, count, rows, way, margin, light, manner, form, at, sums):
+    size = len(picked)
+    total, at = form[ROWS * BLOCK : ROWS * BLOCK + size], at[:size]
+    for i in range(size):
+        total[i] = 0.0
+    take(at, readers.cell, picked)
+    for number in range(count):
+        add_each(total, form[number * BLOCK :], rows[way.row[number], margin - way.move[number] :], at)
+    add_each(total, form[3 * BLOCK :], light.source[k, c], at)
+    if manner.sloped:
+        for d in range(3):
+            add_each(total, form[(4 + d) * BLOCK :], light.slopes[d][k, c], at)
+    if light.cut.shape[1]:
+        take(at, readers.cut, picked)
+        add_each(total, form[7 * BLOCK :], light.cut[c], at)
+    for i in range(size):
+        sums[c, picked[i]] += total[i]
+
+
+@compiled
+def read(paths, readers, ways, n, k, c, count, way, length, margin, light, spacing, manner, work, sums):
+    """Add what elements read of one direction in a plane, as the mean of free `paths` or else of hits."""
+    bits, cell, of_band, rows, form = readers.bits, readers.cell, sums[c], work.rows, work.form
+    r, end = readers.runs[k], readers.runs[k + 1]
+    while r < end:
+        first = readers.first[r]
+        if shared(readers, r, c, manner):
+            last, r = readers.first[r + 1], r + 1
+            if faces_away(readers, first, ways, n):
+                continue
+            work.picked[0] = first
+            depth = readers.depth[c, r - 1]
+            forms_of(paths, readers, ways, n, c, work.picked[:1], depth, count, way, length, spacing, manner, form)
+            for number in range(count):
+                if form[number * BLOCK] != 0:
+                    seen = rows[way.row[number], margin - way.move[number] :]
+                    add_term(of_band, bits, n, cell, first, last, form[number * BLOCK], seen)
+            add_term(of_band, bits, n, cell, first, last, form[3 * BLOCK], light.source[k, c])
+            if manner.sloped:
+                for d in range(3):
+                    add_term(of_band, bits, n, cell, first, last, form[(4 + d) * BLOCK], light.slopes[d][k, c])
+            continue
+        r = next_block(readers, r, end, c, manner)
+        many = pick_marked(bits, n, first, readers.first[r], work.picked)
+        for begun in range(0, many, BLOCK):
+            picked = work.picked[begun : min(begun + BLOCK, many)]
+            forms_of(paths, readers, ways, n, c, picked, -1.0, count, way, length, spacing, manner, form)
+            _read_block(readers, c, k, picked, count, rows, way, margin, light, manner, form, work.at, sums)
 
 
 @compiled
@@ -146,90 +320,63 @@ def _ask_term(values, bits, n, cell, first, last, factor, wanted):
 
 
 @compiled
-def read(paths, readers, ways, n, k, c, count, way, length, rows, margin, light, cells, spacing, manner, form, sums):
-    """Add what elements read of one direction in a plane, as the mean of free `paths` or else of hits."""
-    bits, cell, row, move = readers.bits, readers.cell, way.row, way.move
-    a, u, v = ways.toward[n, 0], ways.toward[n, 1], ways.toward[n, 2]
-    for r in range(readers.runs[k], readers.runs[k + 1]):
-        along = tilt(readers.face, r, a, u, v)
-        if along >= 0:
-            continue
-        first, last = readers.first[r], readers.first[r + 1]
-        if last > first + 1 and (not manner.medium or readers.even[c, r]):
-            depth = readers.depth[c, r] if manner.medium else 0.0
-            if not form_of(paths, readers, r, depth, count, way, length, spacing, cells, manner, form):
-                continue
-            scaled(form, -along * ways.weight[n])
-            of_band = sums[c]
-            for number in range(count):
-                if form[number] != 0:
-                    seen = rows[row[number], margin - move[number] :]
-                    _add_term(of_band, bits, n, cell, first, last, form[number], seen)
-            if manner.medium:
-                _add_term(of_band, bits, n, cell, first, last, form[3], light.source[k, c])
-            if manner.sloped:
-                for d in range(3):
-                    _add_term(of_band, bits, n, cell, first, last, form[4 + d], light.slopes[d][k, c])
-            continue
-        for m in range(first, last):
-            if not marked(bits, n, m):
-                continue
-            extinction = readers.extinction[c, m] if manner.medium else 0.0
-            if not form_of(paths, readers, r, extinction, count, way, length, spacing, cells, manner, form):
-                continue
-            scaled(form, -along * ways.weight[n])
-            _read_one(c, k, m, readers.cut[r], cell[m], count, form, rows, way, margin, light, manner, sums)
-
-
-@register_jitable
-def _ask_one(c, k, m, j, cell, count, form, asked, begun, here, back, manner, wanted):
-    value = wanted[c, m]
-    for number in range(count):
-        asked[number, cell] += form[number] * value
-    if form[7] != 0:
-        back.cut[c, j] += form[7] * value
-    if j >= 0:  # kept apart for now
-        here[2, j - begun] += form[3] * value
-        for a in range(3):
-            here[3 + a, j - begun] += form[4 + a] * value
-        return
-    if manner.medium:
-        back.source[k, c, cell] += form[3] * value
-    if manner.sloped:
-        for a in range(3):
-            back.slopes[a][k, c, cell] += form[4 + a] * value
+def _ask_each(values, form, at, wanted):
+    for i in range(len(at)):
+        values[at[i]] += form[i] * wanted[i]
 
 
 @compiled
-def ask(paths, readers, ways, n, k, c, count, way, length, asked, back, here, cells, spacing, manner, form, wanted):
-    """The transpose of `read`: what elements ask of the rays before each segment, and of what is sent."""
-    bits, cell, begun = readers.bits, readers.cell, cells.first[k]
-    a, u, v = ways.toward[n, 0], ways.toward[n, 1], ways.toward[n, 2]
-    for r in range(readers.runs[k], readers.runs[k + 1]):
-        along = tilt(readers.face, r, a, u, v)
-        if along >= 0:
+def _ask_medium(readers, c, k, picked, back, here, cut_begun, manner, form, wanted):
+    """What elements ask of the sources; those of CUT voxels are kept apart for now."""
+    for i in range(len(picked)):
+        m, value = picked[i], wanted[i]
+        if readers.cut[m] >= 0:
+            j = readers.cut[m] - cut_begun
+            here[2, j] += form[3 * BLOCK + i] * value
+            for a in range(3):
+                here[3 + a, j] += form[(4 + a) * BLOCK + i] * value
             continue
-        first, last, j = readers.first[r], readers.first[r + 1], readers.cut[r]
-        if last > first + 1 and (not manner.medium or readers.even[c, r]):
-            depth = readers.depth[c, r] if manner.medium else 0.0
-            if not form_of(paths, readers, r, depth, count, way, length, spacing, cells, manner, form):
+        back.source[k, c, readers.cell[m]] += form[3 * BLOCK + i] * value
+        if manner.sloped:
+            for a in range(3):
+                back.slopes[a][k, c, readers.cell[m]] += form[(4 + a) * BLOCK + i] * value
+
+
+@compiled
+def ask(paths, readers, ways, n, k, c, count, way, length, back, cut_begun, spacing, manner, work, wanted):
+    """The transpose of `read`: what elements ask of the rays before each segment, and of what is sent."""
+    bits, cell, of_band, asked, form = readers.bits, readers.cell, wanted[c], work.asked, work.form
+    r, end = readers.runs[k], readers.runs[k + 1]
+    while r < end:
+        first = readers.first[r]
+        if shared(readers, r, c, manner):
+            last, r = readers.first[r + 1], r + 1
+            if faces_away(readers, first, ways, n):
                 continue
-            scaled(form, -along * ways.weight[n])
-            of_band = wanted[c]
+            work.picked[0] = first
+            depth = readers.depth[c, r - 1] if manner.medium else 0.0
+            forms_of(paths, readers, ways, n, c, work.picked[:1], depth, count, way, length, spacing, manner, form)
             for number in range(count):
-                if form[number] != 0:
-                    _ask_term(asked[number], bits, n, cell, first, last, form[number], of_band)
+                if form[number * BLOCK] != 0:
+                    _ask_term(asked[number], bits, n, cell, first, last, form[number * BLOCK], of_band)
             if manner.medium:
-                _ask_term(back.source[k, c], bits, n, cell, first, last, form[3], of_band)
+                _ask_term(back.source[k, c], bits, n, cell, first, last, form[3 * BLOCK], of_band)
             if manner.sloped:
                 for d in range(3):
-                    _ask_term(back.slopes[d][k, c], bits, n, cell, first, last, form[4 + d], of_band)
+                    _ask_term(back.slopes[d][k, c], bits, n, cell, first, last, form[(4 + d) * BLOCK], of_band)
             continue
-        for m in range(first, last):
-            if not marked(bits, n, m):
-                continue
-            extinction = readers.extinction[c, m] if manner.medium else 0.0
-            if not form_of(paths, readers, r, extinction, count, way, length, spacing, cells, manner, form):
-                continue
-            scaled(form, -along * ways.weight[n])
-            _ask_one(c, k, m, j, cell[m], count, form, asked, begun, here, back, manner, wanted)
+        r = next_block(readers, r, end, c, manner)
+        many = pick_marked(bits, n, first, readers.first[r], work.picked)
+        for begun in range(0, many, BLOCK):
+            picked = work.picked[begun : min(begun + BLOCK, many)]
+            forms_of(paths, readers, ways, n, c, picked, -1.0, count, way, length, spacing, manner, form)
+            at, of_each = work.at[: len(picked)], form[ROWS * BLOCK : ROWS * BLOCK + len(picked)]
+            take(of_each, of_band, picked)
+            take(at, cell, picked)
+            for number in range(count):
+                _ask_each(asked[number], form[number * BLOCK :], at, of_each)
+            if manner.medium:
+                _ask_medium(readers, c, k, picked, back, work.here, cut_begun, manner, form, of_each)
+            if back.cut.shape[1]:
+                take(at, readers.cut, picked)
+                _ask_each(back.cut[c], form[7 * BLOCK :], at, of_each)

@@ -118,36 +118,26 @@ def through_cut(cells, k, c, number, way, length, before, after, margin, light, 
     rays, sums = here[0, :count], here[1, :count]
     for j in range(count):
         rays[j] = before[margin - way.move[number] + cell[j]]
-    if not manner.medium:
-        for j in range(count):
-            slope = p1[j] * s0 + p2[j] * s1 + p3[j] * s2
-            g0 = p0[j] + p1[j] * e0 + p2[j] * e1 + p3[j] * e2
-            g1 = g0 + share * slope
-            free = max(min(max(g0, g1) / (abs(slope) + tiny), share), zero)
-            radiance = emitted[j] if g0 < zero else rays[j]
-            sums[j] += w * free * radiance
-            rays[j] = emitted[j] if g1 < zero else radiance
-    else:
-        length, limit, extinction = real(length), real(manner.limit), cells.extinction[c, begun : begun + count]
-        source, a, u, v = here[2, :count], here[3, :count], here[4, :count], here[5, :count]
-        for j in range(count):
-            slope = p1[j] * s0 + p2[j] * s1 + p3[j] * s2
-            g0 = p0[j] + p1[j] * e0 + p2[j] * e1 + p3[j] * e2
-            g1 = g0 + share * slope
-            free = max(min(max(g0, g1) / (abs(slope) + tiny), share), zero)
-            start = share - free if g0 < zero else zero
-            radiance = emitted[j] if g0 < zero else rays[j]
-            tau = extinction[j] * length * free
-            time, rise = start + half * free, a[j] * s0 + u[j] * s1 + v[j] * s2
-            off = a[j] * e0 + u[j] * e1 + v[j] * e2 + rise * time
-            rise = rise * free
-            kept, excess, thick = exp(-tau), radiance - (source[j] + off), max(tau, limit)
-            thin = tau < limit
-            mean = mean_of(tau) if thin else (one - kept) / thick
-            bend = bend_of(tau) if thin else (half * (one + kept) - (one - kept) / thick) / thick
-            gone = radiance - tau * mean * excess if thin else source[j] + off + kept * excess
-            sums[j] += w * free * (source[j] + mean * excess - bend * rise)
-            rays[j] = emitted[j] if g1 < zero else gone + tau * bend * rise
+    length, limit, extinction = real(length), real(manner.limit), cells.extinction[c, begun : begun + count]
+    source, a, u, v = here[2, :count], here[3, :count], here[4, :count], here[5, :count]
+    for j in range(count):
+        slope = p1[j] * s0 + p2[j] * s1 + p3[j] * s2
+        g0 = p0[j] + p1[j] * e0 + p2[j] * e1 + p3[j] * e2
+        g1 = g0 + share * slope
+        free = max(min(max(g0, g1) / (abs(slope) + tiny), share), zero)
+        start = share - free if g0 < zero else zero
+        radiance = emitted[j] if g0 < zero else rays[j]
+        tau = extinction[j] * length * free
+        time, rise = start + half * free, a[j] * s0 + u[j] * s1 + v[j] * s2
+        off = a[j] * e0 + u[j] * e1 + v[j] * e2 + rise * time
+        rise = rise * free
+        kept, excess, thick = exp(-tau), radiance - (source[j] + off), max(tau, limit)
+        thin = tau < limit
+        mean = mean_of(tau) if thin else (one - kept) / thick
+        bend = bend_of(tau) if thin else (half * (one + kept) - (one - kept) / thick) / thick
+        gone = radiance - tau * mean * excess if thin else source[j] + off + kept * excess
+        sums[j] += w * free * (source[j] + mean * excess - bend * rise)
+        rays[j] = emitted[j] if g1 < zero else gone + tau * bend * rise
     for j in range(count):
         after[margin + cell[j]] = rays[j]
 
@@ -157,7 +147,7 @@ def through_free(planes, k, c, number, way, length, come, gone, light, manner, w
     """One segment as if all voxels were free."""
     even, depth = planes.even[k, c] == EVEN, planes.depth[k, c]
     path, w = way.share[number] * length, weight * way.share[number]
-    if not manner.medium or (even and depth == 0):
+    if even and depth == 0:
         through_void(come, gone, sums, w)
     elif manner.sloped:
         middle_and_whole(way, number, work.point, work.whole)
@@ -182,9 +172,7 @@ def take_cut(cells, k, c, light, sums, manner, here):
     begun = cells.first[k]
     for j in range(cells.first[k + 1] - begun):
         cell = cells.cell[begun + j]
-        here[1, j], here[6, j] = 0.0, sums[cell]
-        if manner.medium:
-            here[2, j] = light.source[k, c, cell]
+        here[1, j], here[2, j], here[6, j] = 0.0, light.source[k, c, cell], sums[cell]
         if manner.sloped:
             here[3, j], here[4, j], here[5, j] = (
                 light.slopes[0][k, c, cell], light.slopes[1][k, c, cell], light.slopes[2][k, c, cell],

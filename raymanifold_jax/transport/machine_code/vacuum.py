@@ -1,0 +1,266 @@
+"""A coordinate evolution where nothing attenuates.
+
+A ray keeps its place in memory, and what changes is only which voxel it is in: that of voxel i is at i - shift, and every move
+adds to the shift. So a plane costs what its CUT voxels, ghosts and readers do, and, where the sums in voxels are asked for, one
+multiplication a voxel and segment.
+"""
+
+from __future__ import annotations
+
+from numba.extending import register_jitable
+
+from .evolution import most_laps
+from .paths import chords, compiled
+from .readers import BLOCK, ROWS, add_each, forms_of, pick_marked, take, tilt
+
+
+@register_jitable
+def place(cell, shift, size):
+    at = cell - shift
+    return at + size if at < 0 else at
+
+
+@compiled
+def _carry(row, shift, move, planes):
+    """The shift after a move; where the ends of rows are joined, the rays of one column are handed on to the next row's."""
+    height, width = planes.height, planes.width
+    size = height * width
+    shift = (shift + move) % size
+    if planes.wrap_v and width > 1:
+        if move == 1:
+            first = row[place(0, shift, size)]
+            for u in range(height - 1):
+                row[place(u * width, shift, size)] = row[place((u + 1) * width, shift, size)]
+            row[place(size - width, shift, size)] = first
+        elif move == -1:
+            last = row[place(size - 1, shift, size)]
+            for u in range(height - 1, 0, -1):
+                row[place((u + 1) * width - 1, shift, size)] = row[place(u * width - 1, shift, size)]
+            row[place(width - 1, shift, size)] = last
+    return shift
+
+
+@register_jitable
+def _picked(reading, hits, probes, n, k, picked):
+    """Hits and probes of a plane that read in a direction; none of them on the laps before."""
+    if not reading:
+        return picked[0, :0], picked[1, :0]
+    many = pick_marked(hits.bits, n, hits.first[hits.runs[k]], hits.first[hits.runs[k + 1]], picked[0])
+    more = pick_marked(probes.bits, n, probes.first[probes.runs[k]], probes.first[probes.runs[k + 1]], picked[1])
+    return picked[0, :many], picked[1, :more]
+
+
+@compiled
+def _note_rays(readers, picked, row, shift, seen):
+    """Keep the rays of one segment that readers ask for: they may be other ones after it."""
+    size = len(row)
+    for i in range(len(picked)):
+        seen[i] = row[place(readers.cell[picked[i]], shift, size)]
+
+
+@compiled
+def _add_to(sums, row, weight):
+    w = row.dtype.type(weight)
+    for i in range(len(sums)):
+        sums[i] += w * row[i]
+
+
+@compiled
+def _through_cut(cells, k, number, way, row, shift, emitted, here, weight):
+    """What surfaces make of one segment in the voxels that they cut; `here`: rays, and what is summed."""
+    begun, count, size = cells.first[k], cells.first[k + 1] - cells.first[k], len(row)
+    real = row.dtype.type
+    cell, emitted = cells.cell[begun : begun + count], emitted[begun : begun + count]
+    p0, p1 = cells.plane[0, begun : begun + count], cells.plane[1, begun : begun + count]
+    p2, p3 = cells.plane[2, begun : begun + count], cells.plane[3, begun : begun + count]
+    e0, e1, e2 = real(way.begin[number, 0]), real(way.begin[number, 1]), real(way.begin[number, 2])
+    s0, s1, s2 = real(way.step[0]), real(way.step[1]), real(way.step[2])
+    share, w, tiny, zero = real(way.share[number]), real(weight), real(1e-20), real(0)
+    rays, sums = here[0, :count], here[1, :count]
+    for j in range(count):
+        rays[j] = row[place(cell[j], shift, size)]
+    for j in range(count):
+        slope = p1[j] * s0 + p2[j] * s1 + p3[j] * s2
+        g0 = p0[j] + p1[j] * e0 + p2[j] * e1 + p3[j] * e2
+        g1 = g0 + share * slope
+        free = max(min(max(g0, g1) / (abs(slope) + tiny), share), zero)
+        radiance = emitted[j] if g0 < zero else rays[j]
+        sums[j] += w * free * radiance
+        rays[j] = emitted[j] if g1 < zero else radiance
+    for j in range(count):
+        row[place(cell[j], shift, size)] = rays[j]
+
+
+@compiled
+def _from_ghosts(ghosts, k, c, n, ways, row, shift, light):
+    size = len(row)
+    begun, end = ghosts.first[k], ghosts.first[k + 1]
+    if light.radiance.shape[0] == 0:
+        for j in range(begun, end):
+            row[place(ghosts.cell[j], shift, size)] = light.ghost[c, j]
+        return
+    for j in range(begun, end):
+        emitted = light.ghost[c, j]
+        if ghosts.image[j] >= 0:
+            emitted += light.radiance[ghosts.image[j], ways.index[n], c] * light.factor[c, j]
+        row[place(ghosts.cell[j], shift, size)] = emitted
+
+
+@compiled
+def _take_cut(cells, k, sums, here):
+    begun = cells.first[k]
+    for j in range(cells.first[k + 1] - begun):
+        here[1, j], here[2, j] = 0.0, sums[cells.cell[begun + j]]
+
+
+@compiled
+def _put_cut(cells, k, sums, here):
+    begun = cells.first[k]
+    for j in range(cells.first[k + 1] - begun):
+        sums[cells.cell[begun + j]] = here[2, j] + here[1, j]
+
+
+@compiled
+def _add_times(total, form, seen):
+    for i in range(len(total)):
+        total[i] += form[i] * seen[i]
+
+
+@compiled
+def _read(paths, readers, picked, ways, n, count, way, seen, emitted, manner, form, at, sums):
+    """Add what elements read of one direction in a plane, as the mean of free `paths` or else of hits."""
+    for first in range(0, len(picked), BLOCK):
+        last = min(first + BLOCK, len(picked))
+        readers_here, size = picked[first:last], last - first
+        forms_of(paths, readers, ways, n, 0, readers_here, 0.0, count, way, 0.0, 0.0, manner, form)
+        total = form[ROWS * BLOCK : ROWS * BLOCK + size]
+        for i in range(size):
+            total[i] = 0.0
+        for number in range(count):
+            _add_times(total, form[number * BLOCK :], seen[number, first:last])
+        if paths and len(emitted):
+            take(at, readers.cut, readers_here)
+            add_each(total, form[7 * BLOCK :], emitted, at[:size])
+        for i in range(size):
+            sums[readers_here[i]] += total[i]
+
+
+@compiled
+def in_vacuum(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, work, at_hits, at_probes, in_voxels):
+    """As `evolution.forwards`, without a medium."""
+    count, bands, size = planes.even.shape[0], planes.even.shape[1], planes.height * planes.width
+    rows, shift, way, here, form = work.rows, work.shift, work.way, work.here, work.form
+    most = len(rows)
+    for first in range(0, len(chosen), most):
+        batch = chosen[first : first + most]
+        laps = most_laps(ways, batch)
+        for c in range(bands):
+            for b in range(len(batch)):
+                shift[b] = 0
+                for i in range(size):
+                    rows[b, i] = 0
+            emitted = light.cut[c]
+            for when in range(-(laps - 1) * count, count):
+                reading = when >= 0
+                # Batches may hold both senses: those of one sense go together.
+                for sense in (1, -1):
+                    k = when % count if sense > 0 else count - 1 - when % count
+                    summing = reading and manner.fluence and ghosts.first[k + 1] - ghosts.first[k] < size
+                    sums = in_voxels[k, c] if summing else work.nowhere
+                    if summing:
+                        _take_cut(cut, k, sums, here)
+                    for b in range(len(batch)):
+                        n = batch[b]
+                        if ways.sense[n] != sense or when < -(ways.laps[n] - 1) * count:
+                            continue
+                        segments, row = chords(ways, n, when, planes.width, planes.wrap_v, way), rows[b]
+                        of_hits, of_probes = _picked(reading, hits, probes, n, k, work.picked)
+                        for number in range(segments):
+                            shift[b] = _carry(row, shift[b], way.move[number], planes)
+                            if reading:
+                                _note_rays(hits, of_hits, row, shift[b], work.hits[number])
+                                _note_rays(probes, of_probes, row, shift[b], work.probes[number])
+                            if summing:
+                                ahead, weight = shift[b], ways.weight[n] * way.share[number]
+                                _add_to(sums[:ahead], row[size - ahead :], weight)
+                                _add_to(sums[ahead:], row[: size - ahead], weight)
+                            _through_cut(cut, k, number, way, row, shift[b], emitted, here, ways.weight[n])
+                            _from_ghosts(ghosts, k, c, n, ways, row, shift[b], light)
+                        if reading:
+                            there = emitted, manner, form, work.at
+                            _read(False, hits, of_hits, ways, n, segments, way, work.hits, *there, at_hits[c])
+                            _read(True, probes, of_probes, ways, n, segments, way, work.probes, *there, at_probes[c])
+                    if summing:
+                        _put_cut(cut, k, sums, here)
+
+
+@compiled
+def _number_cut(cells, k, number, way, row, shift, sent):
+    """One segment through the voxels that surfaces cut."""
+    size = len(row)
+    for j in range(cells.first[k], cells.first[k + 1]):
+        slope = tilt(cells.plane, j, way.step[0], way.step[1], way.step[2])
+        g0 = cells.plane[0, j] + tilt(cells.plane, j, way.begin[number, 0], way.begin[number, 1], way.begin[number, 2])
+        if g0 < 0 or g0 + way.share[number] * slope < 0:
+            row[place(cells.cell[j], shift, size)] = sent[j]
+
+
+@register_jitable
+def _note_link(m, code, share, seen, source, weight):
+    if code > 0 and share != 0:
+        if seen[m] < source.shape[1]:
+            source[m, seen[m]], weight[m, seen[m]] = code, share
+        seen[m] += 1
+
+
+@compiled
+def _note_links(paths, readers, picked, ways, n, count, way, numbers, sent, manner, form, seen, source, weight):
+    """Add what elements of a plane see in one direction to their lists, as far as these reach; `seen` counts it all."""
+    for first in range(0, len(picked), BLOCK):
+        last = min(first + BLOCK, len(picked))
+        forms_of(paths, readers, ways, n, 0, picked[first:last], 0.0, count, way, 0.0, 0.0, manner, form)
+        for i in range(last - first):
+            m = picked[first + i]
+            for number in range(count):
+                _note_link(m, numbers[number, first + i], form[number * BLOCK + i], seen, source, weight)
+            if form[7 * BLOCK + i] != 0:
+                _note_link(m, sent[readers.cut[m]], form[7 * BLOCK + i], seen, source, weight)
+
+
+@compiled
+def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut, of_ghosts, of_hits, of_probes):
+    """Rays that carry the number of the voxel they left, and which of these elements read (see `transport.links`).
+
+    In the `chosen` directions: (seen, source, weight) of hits and probes, [M], [M, S], [M, S]. `of_cut` and `of_ghosts` are
+    the numbers of listed voxels, 0 for those that send nothing.
+    """
+    count, size = planes.even.shape[0], planes.height * planes.width
+    rows, shift, way, form = work.rows, work.shift, work.way, work.form
+    most = len(rows)
+    for first in range(0, len(chosen), most):
+        batch = chosen[first : first + most]
+        for b in range(len(batch)):
+            shift[b] = 0
+            for i in range(size):
+                rows[b, i] = 0
+        for when in range(-(most_laps(ways, batch) - 1) * count, count):
+            for sense in (1, -1):
+                k = when % count if sense > 0 else count - 1 - when % count
+                for b in range(len(batch)):
+                    n = batch[b]
+                    if ways.sense[n] != sense or when < -(ways.laps[n] - 1) * count:
+                        continue
+                    segments, row = chords(ways, n, when, planes.width, planes.wrap_v, way), rows[b]
+                    read_hits, read_probes = _picked(when >= 0, hits, probes, n, k, work.picked)
+                    for number in range(segments):
+                        shift[b] = _carry(row, shift[b], way.move[number], planes)
+                        if when >= 0:
+                            _note_rays(hits, read_hits, row, shift[b], work.hits[number])
+                            _note_rays(probes, read_probes, row, shift[b], work.probes[number])
+                        _number_cut(cut, k, number, way, row, shift[b], of_cut)
+                        for j in range(ghosts.first[k], ghosts.first[k + 1]):
+                            row[place(ghosts.cell[j], shift[b], size)] = of_ghosts[j]
+                    if when >= 0:
+                        there = of_cut, manner, form
+                        _note_links(False, hits, read_hits, ways, n, segments, way, work.hits, *there, *of_hits)
+                        _note_links(True, probes, read_probes, ways, n, segments, way, work.probes, *there, *of_probes)
