@@ -139,7 +139,9 @@ def test_links(boundary, monkeypatch):
     monkeypatch.setattr(native, "serves", lambda *_: False)
     expected = find_links(case.layout, case.transport.ordinates)
     for method in ("arriving", "sent"):
-        _close(getattr(found, method)(case.elements), getattr(expected, method)(case.elements), case.free)
+        right = getattr(expected, method)(case.elements)
+        _close(getattr(found, method)(case.elements), right, case.free)
+        _close(jax.jit(getattr(found, method))(case.elements), right, case.free)  # the same list, followed by XLA
 
 
 @pytest.mark.parametrize("name", ["vacuum", "around an axis, mirrored", "around two axes"])

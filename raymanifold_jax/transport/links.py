@@ -52,10 +52,18 @@ class _Rows(eqx.Module):
     element: Int[Array, " M"]
 
 
+class _List(eqx.Module):
+    """The links one by one: found by machine code, and followed by it where numbers are known."""
+
+    element: Int[Array, " L"]
+    source: Int[Array, " L"]
+    weight: Float[Array, " L"]
+
+
 class Links(eqx.Module):
     """Sums at the elements of what other elements send, and their transpose."""
 
-    rows: tuple[_Rows, ...]
+    rows: tuple[_Rows, ...] | _List
     # Voxels that send, numbered: of which elements what they send is made.
     element: Int[Array, " I"]
     share: Float[Array, " I"]
@@ -65,10 +73,20 @@ class Links(eqx.Module):
 
     def arriving(self, exitance: Float[Array, "C E"]) -> Float[Array, "C E"]:
         """As `sweep`: sums over directions of weight * cosine * radiance arriving at each element."""
-        return _arriving(self, exitance)
+        if not isinstance(self.rows, _List) or not native.at_hand((self.rows, exitance)):
+            return _arriving(self, exitance)
+        share, number, element = np.asarray(self.share), np.asarray(self.number), np.asarray(self.element)
+        voxels = [np.bincount(number, band[element] * share, self.numbers) for band in np.asarray(exitance)]
+        found = native.follow(self.rows.element, self.rows.source, self.rows.weight, np.array(voxels), self.elements)
+        return jnp.asarray(found, exitance.dtype)
 
     def sent(self, asked: Float[Array, "C E"]) -> Float[Array, "C E"]:
         """The transpose of `arriving`."""
+        if isinstance(self.rows, _List) and native.at_hand((self.rows, asked)):
+            voxels = native.follow(self.rows.source, self.rows.element, self.rows.weight, np.asarray(asked), self.numbers)
+            share, number, element = np.asarray(self.share), np.asarray(self.number), np.asarray(self.element)
+            found = [np.bincount(element, band[number] * share, self.elements) for band in voxels]
+            return jnp.asarray(np.array(found), asked.dtype)
         like = jax.ShapeDtypeStruct(asked.shape, asked.dtype)
         return jax.linear_transpose(lambda exitance: _arriving(self, exitance), like)(asked)[0]
 
@@ -79,6 +97,8 @@ def _arriving(links: Links, exitance: Float[Array, "C E"]) -> Float[Array, "C E"
     voxels = jnp.zeros((bands, links.numbers), exitance.dtype)
     voxels = voxels.at[:, links.number].add(exitance[:, links.element] * links.share)
     sums = jnp.zeros((bands, links.elements), exitance.dtype)
+    if isinstance(links.rows, _List):
+        return sums.at[:, links.rows.element].add(links.rows.weight * voxels[:, links.rows.source])
     for rows in links.rows:
 
         def add(total, link):
@@ -105,11 +125,11 @@ def find_links(layout: Layout, ordinates: tuple[Ordinates, ...]) -> Links:
     numbers[sending] = np.arange(1, len(sending) + 1)
     numbers = numbers.reshape(layout.padded)
     if native.serves(layout, ordinates, ()):
-        rows = [_Rows(*map(jnp.asarray, seen)) for seen in native.views(layout, ordinates, numbers)]
+        rows = _List(*map(jnp.asarray, native.views(layout, ordinates, numbers)))
     else:
-        rows = _swept_rows(layout, ordinates, numbers)
+        rows = tuple(_swept_rows(layout, ordinates, numbers))
     return Links(
-        rows=tuple(rows),
+        rows=rows,
         element=layout.source_element,
         share=layout.share,
         number=jnp.asarray(number + 1, np.int32),

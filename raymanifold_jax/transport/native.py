@@ -6,7 +6,7 @@ directions and extinction are. Each core takes some of the directions through al
 This serves known numbers of one device that is a CPU, where numba is installed; all else is left to `characteristic`, which
 gives the same results to rounding.
 
-Public: `installed`, `serves`, `sweep`, `unsweep`, `views`, `Seen`, `hit_bits`.
+Public: `installed`, `serves`, `at_hand`, `sweep`, `unsweep`, `views`, `follow`, `hit_bits`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import warnings
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
@@ -192,50 +193,64 @@ def unsweep(
     return jnp.asarray(exitance, real), source, tuple(map(jnp.asarray, fields[1:])) if sloped else None
 
 
-class Seen(NamedTuple):
-    """What the elements of some reads see: numbers of voxels that send, and their weights; padded with weight 0."""
-
-    source: np.ndarray  # [S, M]
-    weight: np.ndarray
-    element: np.ndarray  # [M]
-
-
-def views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray) -> list[Seen]:
-    """In vacuum, what elements see: of voxels that send the `numbers`, 1 and up, [X, Y, Z]."""
+def views(
+    layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray
+) -> tuple[Int[np.ndarray, " L"], Int[np.ndarray, " L"], Float[np.ndarray, " L"]]:
+    """In vacuum, what elements see of voxels that send the `numbers` [X, Y, Z], 1 and up: element, number and weight."""
     from . import machine_code as code
     from .derivative import Manner
 
     real, found = np.dtype(layout.plane.dtype), []
 
-    def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
+    def along(line: _Axis, arguments: tuple, how: machine_code.Manner, axis: int) -> None:
         planes, cut, hits, probes = arguments
-        readers = hits, probes
         codes = numbers.transpose(AXES[axis]).reshape(-1).astype(np.int32)
         listed = _frozen(tuple(codes[_flat(cells, line.area)] for cells in (cut, line.ghosts)))
 
-        def run(part: np.ndarray):
-            lists = lambda most: tuple((np.zeros((len(r.cell), s), np.int32), np.zeros((len(r.cell), s), real))
-                                       for r, s in zip(readers, most, strict=True))  # fmt: skip
-            most = (0, 0)
-            for _ in range(2):  # how long the lists must be, and what is in them
-                seen, filled = [np.zeros(len(r.cell), int) for r in readers], lists(most)
-                work = _standing(code, line, min(how.rows, len(part)), np.dtype(np.int32))
-                of_hits, of_probes = ((s, *f) for s, f in zip(seen, filled, strict=True))
-                there = listed[0], listed[1], of_hits, of_probes
-                code.views(part, line.ways, planes, cut, line.ghosts, hits, probes, how, work, *there)
-                most = tuple(int(s.max(initial=0)) for s in seen)
-            return filled
+        def run(part: np.ndarray) -> list[tuple[np.ndarray, ...]]:
+            work, seen = _standing(code, line, min(how.rows, len(part)), np.dtype(np.int32)), []
+            for first in range(0, len(part), how.rows):
+                batch = part[first : first + how.rows]
+                # A hit sees by three segments at most, a probe its own surface as well.
+                most = sum(kinds * int(np.unpackbits(r.bits[batch]).sum()) for kinds, r in ((3, hits), (4, probes)))
+                lists = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, real)
+                known = batch, line.ways, planes, cut, line.ghosts, hits, probes, how, work
+                count = code.views(*known, *listed, *lists)
+                seen.append(tuple(values[:count].copy() for values in lists))
+            return seen
 
-        of_parts = list(on_cores(run, line.parts))
-        for kind, of_kind in enumerate(readers):
-            source, weight = (np.concatenate([filled[kind][i] for filled in of_parts], axis=1) for i in (0, 1))
-            used = weight.any(axis=1)
-            element = np.asarray(of_kind.element)[used]
-            found.append(Seen(np.ascontiguousarray(source[used].T), np.ascontiguousarray(weight[used].T), element))
+        for seen in on_cores(run, line.parts):
+            found.extend(seen)
 
-    for line in _lines(Manner(False), layout, ordinates, None, 1, False, real):
-        along(*line)
-    return [seen for seen in found if seen.weight.size]
+    for axis, *of_axis in _lines(Manner(False), layout, ordinates, None, 1, False, real):
+        along(*of_axis, axis)
+    none = np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, real)
+    element, source, weight = (np.concatenate(values) for values in zip(none, *found, strict=True))
+    return element, source, weight
+
+
+def at_hand(arrays: Any) -> bool:
+    """Whether these can be worked with here."""
+    leaves = jax.tree.leaves(arrays)
+    if checks.is_traced(arrays) or not installed():
+        return False
+    return all(d.platform == "cpu" for a in leaves if isinstance(a, jax.Array) for d in a.devices())
+
+
+def follow(to: Array, of: Array, weight: Array, sent: Float[np.ndarray, "C n"], count: int) -> Float[np.ndarray, "C m"]:
+    """Sums over links: of `weight` times what is `sent` at `of`, in each of `count` places `to`."""
+    from . import machine_code as code
+
+    links = _frozen(tuple(map(np.asarray, (to, of, weight))))
+    sent = _frozen(np.asarray(sent, float))
+    ends = np.linspace(0, len(links[0]), count_cores() + 1).astype(int)
+
+    def run(number: int) -> np.ndarray:
+        got = np.zeros((len(sent), count))
+        code.follow(ends[number], ends[number + 1], *links, sent, got)
+        return got
+
+    return sum(on_cores(run, range(count_cores())))
 
 
 def hit_bits(
@@ -272,9 +287,9 @@ def _lines(manner: Any, layout: Layout, ordinates, extinction, bands: int, slope
     """Each axis: its number, what is listed along it, and the arguments of `machine_code`."""
     from . import machine_code as code
 
-    for axis, own in enumerate(ordinates):
-        if own.weight.shape[0] and int(own.chunks):
-            line = _axis(layout, own, axis)
+    used = [axis for axis, own in enumerate(ordinates) if own.weight.shape[0] and int(own.chunks)]
+    for axis, line in zip(used, on_cores(lambda axis: _axis(layout, ordinates[axis], axis), used), strict=True):
+        if line.parts:
             medium = _medium(layout, line, axis, extinction, bands, real)
             arguments = _arguments(code, layout, line, medium, axis)
             yield axis, line, _frozen(arguments), _manner(code, manner, medium, sloped, line, real)
@@ -387,9 +402,10 @@ def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
     ghost = np.ones(layout.padded, bool)
     ghost[tuple(slice(p, n - p) for p, n in zip(layout.pad, layout.padded, strict=True))] = False
     ghost = turned(ghost)
-    plane = [turned(layout.plane[row]) for row in (0, *(1 + a for a in order))]
+    planes = np.asarray(layout.plane)
+    plane = [turned(planes[row]) for row in (0, *(1 + a for a in order))]
     surface = (plane[0] != 1.0) & ~ghost
-    real = np.dtype(layout.plane.dtype)
+    real = planes.dtype
     cut = _cells(code, surface, plane, None, real)
     ghosts = _cells(code, ghost, None, turned(layout.inflow_image), real)
     number = np.full(count * height * width, -1)
@@ -470,10 +486,8 @@ def _packed_marks(code, marked: tuple, image: np.ndarray, face: np.ndarray) -> n
     """Who reads in each direction, as bits [N, M / 8], of the readers that are `image` in the layout."""
     ways, chunk, place, words, wanted = marked
     bits = np.zeros((len(chunk), -(-len(image) // 8)), np.uint8)
-    known = *_frozen((ways, words, np.uint32(wanted), chunk, place, image.astype(np.int32), face)), bits
-    parts = [np.arange(core, len(chunk), count_cores()) for core in range(count_cores())]
-    for _ in on_cores(lambda part: code.pack(part, *known), [p for p in parts if len(p)]):
-        pass
+    known = _frozen((ways, words, np.uint32(wanted), chunk, place, image.astype(np.int32), face))
+    code.pack(np.arange(len(chunk)), *known, bits)
     return bits
 
 

@@ -11,14 +11,14 @@ Numbers of whole planes are of the fields' own type; those of elements are worke
 numba keeps what it has compiled, by the time stamp of the file that holds the outermost function: after a change in another
 file here, touch `evolution.py`, `vacuum.py` and `marks.py`.
 
-Public: `forwards`, `backwards`, `in_vacuum`, `views`, `mark`, `pack`, and the tuples that they take.
+Public: `forwards`, `backwards`, `in_vacuum`, `views`, `follow`, `mark`, `pack`, and the tuples that they take.
 """
 
 from .arguments import EVEN, PATCHY, UNEVEN, Around, Cells, Elements, Light, Manner, Planes, Readers, Segments, Standing, Ways, Work
 from .evolution import backwards, forwards
 from .marks import mark, pack
 from .readers import BLOCK, ROWS
-from .vacuum import in_vacuum, views
+from .vacuum import follow, in_vacuum, views
 
 __all__ = [
     "BLOCK",
@@ -38,6 +38,7 @@ __all__ = [
     "Ways",
     "Work",
     "backwards",
+    "follow",
     "forwards",
     "in_vacuum",
     "mark",

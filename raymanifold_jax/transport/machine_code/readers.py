@@ -78,22 +78,30 @@ def take(to, values, picked):
         to[i] = values[picked[i]]
 
 
+@register_jitable
+def _used(r, manner):
+    """Whether a row of the form is anything but 0: without a medium, or slopes, some are not looked at."""
+    return r < 3 or r == 7 or (manner.medium and (r == 3 or manner.sloped))
+
+
 @compiled
-def _load(readers, ways, n, picked, form):
+def _load(paths, readers, ways, n, picked, manner, form):
     """The surfaces of readers, and the cosine and the weight of a direction."""
     size, w = len(picked), ways.weight[n]
     a, u, v = ways.toward[n, 0], ways.toward[n, 1], ways.toward[n, 2]
     for r in range(4):
         take(form[(_FACE + r) * BLOCK : (_FACE + r + 1) * BLOCK], readers.face[r], picked)
-        take(form[(_PLANE + r) * BLOCK : (_PLANE + r + 1) * BLOCK], readers.plane[r], picked)
+        if paths:
+            take(form[(_PLANE + r) * BLOCK : (_PLANE + r + 1) * BLOCK], readers.plane[r], picked)
     for i in range(size):
         j = np.uintp(i)
         form[j + _OF] = -w * (form[j + _F1] * a + form[j + _F2] * u + form[j + _F3] * v)
         form[j + _OT] = 0.0
     for r in range(8):
         of_row = np.uintp(r) * np.uintp(BLOCK)
-        for i in range(size):
-            form[np.uintp(i) + of_row] = 0.0
+        if _used(r, manner):
+            for i in range(size):
+                form[np.uintp(i) + of_row] = 0.0
 
 
 @compiled
@@ -189,7 +197,7 @@ def forms_of(paths, readers, ways, n, c, picked, depth, count, way, length, spac
     As the mean of free `paths` or else of hits. All have the extinction `depth`, or each its own if that is negative.
     """
     size = len(picked)
-    _load(readers, ways, n, picked, form)
+    _load(paths, readers, ways, n, picked, manner, form)
     if manner.medium:
         take(form[_HEIGHT * BLOCK : (_HEIGHT + 1) * BLOCK], readers.height, picked)
         of_each = form[_DEPTH * BLOCK : (_DEPTH + 1) * BLOCK]
@@ -219,20 +227,21 @@ def forms_of(paths, readers, ways, n, c, picked, depth, count, way, length, spac
             _hits(form, size, to, b, e, s, share, length, manner.limit, manner.sloped)
         else:
             _hits_in_vacuum(form, size, to, b, e)
-    _finish(form, size, 1e-6)
+    _finish(form, size, manner)
 
 
 @compiled
-def _finish(form, size, least):
+def _finish(form, size, manner):
     for i in range(size):
         j = np.uintp(i)
         total = form[j + _OT]
-        form[j + _OF] = form[j + _OF] / max(total, least) if total > least else 0.0
+        form[j + _OF] = form[j + _OF] / max(total, 1e-6) if total > 1e-6 else 0.0
     for r in range(8):
         of_row = np.uintp(r) * np.uintp(BLOCK)
-        for i in range(size):
-            j = np.uintp(i)
-            form[j + of_row] *= form[j + _OF]
+        if _used(r, manner):
+            for i in range(size):
+                j = np.uintp(i)
+                form[j + of_row] *= form[j + _OF]
 
 
 @register_jitable
@@ -333,8 +342,9 @@ def _ask_medium(readers, c, k, picked, back, here, cut_begun, manner, form, want
         if readers.cut[m] >= 0:
             j = readers.cut[m] - cut_begun
             here[2, j] += form[3 * BLOCK + i] * value
-            for a in range(3):
-                here[3 + a, j] += form[(4 + a) * BLOCK + i] * value
+            if manner.sloped:
+                for a in range(3):
+                    here[3 + a, j] += form[(4 + a) * BLOCK + i] * value
             continue
         back.source[k, c, readers.cell[m]] += form[3 * BLOCK + i] * value
         if manner.sloped:

@@ -205,38 +205,40 @@ def _number_cut(cells, k, number, way, row, shift, sent):
             row[place(cells.cell[j], shift, size)] = sent[j]
 
 
-@register_jitable
-def _note_link(m, code, share, seen, source, weight):
-    if code > 0 and share != 0:
-        if seen[m] < source.shape[1]:
-            source[m, seen[m]], weight[m, seen[m]] = code, share
-        seen[m] += 1
-
-
 @compiled
-def _note_links(paths, readers, picked, ways, n, count, way, numbers, sent, manner, form, seen, source, weight):
-    """Add what elements of a plane see in one direction to their lists, as far as these reach; `seen` counts it all."""
+def _note_links(
+    paths, readers, picked, ways, n, count, way, numbers, sent, manner, form, links, element, source, weight
+):
+    """Add what elements of a plane see in one direction to the list of `links`, and return how long it is."""
     for first in range(0, len(picked), BLOCK):
         last = min(first + BLOCK, len(picked))
         forms_of(paths, readers, ways, n, 0, picked[first:last], 0.0, count, way, 0.0, 0.0, manner, form)
-        for i in range(last - first):
-            m = picked[first + i]
-            for number in range(count):
-                _note_link(m, numbers[number, first + i], form[number * BLOCK + i], seen, source, weight)
-            if form[7 * BLOCK + i] != 0:
-                _note_link(m, sent[readers.cut[m]], form[7 * BLOCK + i], seen, source, weight)
+        for number in range(4 if paths else 3):
+            if 3 > number >= count:
+                continue
+            shares = form[(7 if number == 3 else number) * BLOCK :]
+            for i in range(last - first):
+                m, share = picked[first + i], shares[i]
+                if number < 3:
+                    code = numbers[number, first + i]
+                else:
+                    code = sent[readers.cut[m]] if share != 0 else 0
+                # Written in any case: a processor cannot guess which count.
+                element[links], source[links], weight[links] = readers.element[m], code, share
+                links += 1 if (code > 0) & (share != 0) else 0
+    return links
 
 
 @compiled
-def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut, of_ghosts, of_hits, of_probes):
+def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut, of_ghosts, element, source, weight):
     """Rays that carry the number of the voxel they left, and which of these elements read (see `transport.links`).
 
-    In the `chosen` directions: (seen, source, weight) of hits and probes, [M], [M, S], [M, S]. `of_cut` and `of_ghosts` are
-    the numbers of listed voxels, 0 for those that send nothing.
+    Written one by one in the `chosen` directions: element, number and weight; returns how many there are. `of_cut` and
+    `of_ghosts` are the numbers of listed voxels, 0 for those that send nothing.
     """
     count, size = planes.even.shape[0], planes.height * planes.width
     rows, shift, way, form = work.rows, work.shift, work.way, work.form
-    most = len(rows)
+    most, links = len(rows), 0
     for first in range(0, len(chosen), most):
         batch = chosen[first : first + most]
         for b in range(len(batch)):
@@ -262,5 +264,19 @@ def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut,
                             row[place(ghosts.cell[j], shift[b], size)] = of_ghosts[j]
                     if when >= 0:
                         there = of_cut, manner, form
-                        _note_links(False, hits, read_hits, ways, n, segments, way, work.hits, *there, *of_hits)
-                        _note_links(True, probes, read_probes, ways, n, segments, way, work.probes, *there, *of_probes)
+                        known = ways, n, segments, way
+                        links = _note_links(
+                            False, hits, read_hits, *known, work.hits, *there, links, element, source, weight
+                        )
+                        links = _note_links(
+                            True, probes, read_probes, *known, work.probes, *there, links, element, source, weight
+                        )
+    return links
+
+
+@compiled
+def follow(first, last, to, of, weight, sent, got):
+    """Add the weight of links `first` to `last` times what is sent [C, n] to what is got [C, m]."""
+    for c in range(sent.shape[0]):
+        for i in range(first, last):
+            got[c, to[i]] += weight[i] * sent[c, of[i]]
