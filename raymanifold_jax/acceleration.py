@@ -33,6 +33,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from .arrays import as_jax
 from .layout import Layout
 from .operator import Light, Materials, Transport
 from .placement import known
@@ -238,18 +239,18 @@ def _coarse_level(level: _Level) -> _Level:
 def make_diffusion(transport: Transport, surfaces: Surfaces, stuff: Materials) -> Diffusion:
     """The preconditioner of a scene on its lattice."""
     layout = transport.layout
-    weights = sum(jnp.sum(o.weight) for o in transport.ordinates) * len(layout.unfolding.images())
-    free = np.clip(known(transport.coverage / weights), 0.0, 1.0)
+    weights = sum(known(o.weight).sum() for o in transport.ordinates) * len(layout.unfolding.images())
+    free = np.clip(known(transport.coverage) / weights, 0.0, 1.0)
     ends = _distance(free == 0, surfaces, layout.shape)
     periodic = [a for a in range(3) if layout.pad[a] == 0 and a not in layout.unfolding.axes]
     shape = surfaces.solid.shape  # on a mesh, the layout's may have empty columns behind
     probe = np.where([a in periodic for a in range(3)], surfaces.probe % shape, surfaces.probe)
     probe = np.clip(probe, 0, np.array(shape) - 1)
     flat = np.asarray(np.ravel_multi_index(tuple(probe.T), layout.shape)) if len(probe) else np.zeros(0, int)
-    place = jnp.asarray if isinstance(layout, Layout) else layout.place
+    place = as_jax if isinstance(layout, Layout) else layout.place
     area = surfaces.area / layout.spacing**2  # powers are in units of a voxel's face
     return _assemble(
-        stuff, place(free), place(1 / (_FREE_PATH * ends)), jnp.asarray(area), jnp.asarray(flat, np.int32),
+        stuff, place(free), place(1 / (_FREE_PATH * ends)), as_jax(area), as_jax(flat, np.int32),
         layout.spacing, tuple(a in periodic for a in range(3)), transport.albedo is not None,
     )  # fmt: skip
 

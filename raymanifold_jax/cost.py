@@ -34,6 +34,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from . import checks
+from .arrays import real_dtype
 from .blocks import even
 from .layout import AXES
 from .partition import SLOTS
@@ -191,7 +192,7 @@ def _directions(scheme: Any, quadrature: Any) -> list[tuple[np.ndarray, float]]:
 
 def _costs(shape, pe, groups, scheme, bands: int, medium: bool) -> tuple[int, int, int, int, int, int, int]:
     reach = scheme.half_width if isinstance(scheme, LightRayCube) else 1
-    number = jnp.zeros(0).dtype.itemsize
+    number = real_dtype().itemsize
     node_bytes = number * numbers_per_node(bands, medium)
     nodes, rays, updates, once, exchanged = 0, 0, 0, 0.0, 0.0
     for axis, (hops, single) in enumerate(groups):
@@ -225,7 +226,7 @@ def _sent(scene: Scene, pe: tuple[int, int], groups: list[tuple[np.ndarray, floa
         else:
             steps, rims = 2 * shape[axis], rows * width + columns * height
         sent += len(hops) * steps * 2 * rims
-    return sent * scene.bands * jnp.zeros(0).dtype.itemsize
+    return sent * scene.bands * real_dtype().itemsize
 
 
 def _bytes(size: float) -> str:

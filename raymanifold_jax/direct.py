@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import checks
+from .arrays import as_jax, numpy_or_jax, real_dtype
 from .emitters import CLEARANCE, brighter_than, emitting_elements, point_light
 from .layout import Layout
 from .march import fill
@@ -61,7 +62,7 @@ def first_flight(
     compact = compact_sources(scene, surfaces)
     glow = materials.medium_source
     if compact is not None and glow is not None:
-        glow = jnp.where(stored(layout, jnp.asarray(compact.emits)), 0.0, glow)
+        glow = jnp.where(stored(layout, as_jax(compact.emits)), 0.0, glow)
 
     def of_surfaces_and_skies() -> Light:
         swept = _swept(transport, Light(materials.emission, glow), sky)
@@ -95,7 +96,8 @@ def first_flight(
 def brightest(scene: Scene, sky: Array | None) -> Float[Array, ""]:
     """The largest of the radiances of the sky and of the irradiances of suns."""
     sent = [light.irradiance for light in scene.lights if isinstance(light, Sun)] + ([] if sky is None else [sky])
-    return jnp.stack([jnp.zeros(()), *(jnp.max(jnp.asarray(value, float)) for value in sent)]).max()
+    xp = numpy_or_jax(sent)
+    return as_jax(xp.stack([np.zeros(()), *(xp.max(xp.asarray(value)) for value in sent)]).max(), real_dtype())
 
 
 def _swept(transport: Transport, leaving: Light, sky: Inflow | None) -> Light:
@@ -121,7 +123,7 @@ def sky_inflow(scene: Scene, layout: Layout | Partition, quadrature: Quadrature)
 
 def sky_radiance(scene: Scene, directions: Float[Array, "n 3"] | Float[np.ndarray, "n 3"]) -> Float[Array, "C n"]:
     """Radiance of all skies along directions of travel."""
-    total = jnp.zeros((scene.bands, len(directions)))
+    total = as_jax(np.zeros((scene.bands, len(directions))), real_dtype())
     for light in scene.lights:
         if isinstance(light, Sky):
             radiance = jnp.asarray(light.radiance_along(jnp.asarray(directions, total.dtype)))
@@ -131,8 +133,7 @@ def sky_radiance(scene: Scene, directions: Float[Array, "n 3"] | Float[np.ndarra
 
 def _dark(materials: Materials) -> Light:
     """Nothing leaves anywhere."""
-    voxels = None if materials.extinction is None else jnp.zeros_like(materials.extinction)
-    return Light(jnp.zeros_like(materials.emission), voxels)
+    return jax.tree.map(lambda a: as_jax(np.zeros(a.shape, a.dtype)), Light(materials.emission, materials.extinction))
 
 
 def _from_sun(
@@ -152,14 +153,19 @@ def _from_sun(
     key = ("sun", *direction.tolist(), scene.bands, layout.shapes.mesh if isinstance(layout, Partition) else None)
     transport = make() if prepared is None else prepared.reuse(key, materials.extinction, make)
     images = layout.unfolding.images()
-    irradiance = jnp.broadcast_to(sun.irradiance, (scene.bands,))
     # Only the scene itself is lit; a mirror image of it gets what mirrors reflect.
-    here = jnp.array([float(np.all(signs > 0)) for _, signs in images])
-    radiance = here[:, None, None] * jnp.broadcast_to(irradiance, (len(images), count, scene.bands))
-    mean = transport(_dark(materials), Inflow(radiance))
-    assert mean.voxels is not None
+    here = np.array([float(np.all(signs > 0)) for _, signs in images], real_dtype())
+    xp = numpy_or_jax(sun)
+    radiance = here[:, None, None] * xp.broadcast_to(xp.asarray(sun.irradiance), (len(images), count, scene.bands))
+    mean = transport(_dark(materials), Inflow(as_jax(radiance, real_dtype())))
     cosines = sum(np.maximum(-(surfaces.normal * signs) @ direction, 0) for _, signs in images)
-    return Light(mean.elements * jnp.asarray(cosines, radiance.dtype) / jnp.pi, mean.voxels * (len(images) / (4 * np.pi)))
+    return _of_beam(mean, as_jax(cosines, real_dtype()), float(len(images)))
+
+
+@jax.jit
+def _of_beam(mean: Light, cosines: Float[Array, " E"], images: float) -> Light:
+    assert mean.voxels is not None
+    return Light(mean.elements * cosines / jnp.pi, mean.voxels * (images / (4 * jnp.pi)))
 
 
 def _beam_transport(layout: Layout | Partition, beam: Quadrature, extinction, bands: int) -> Transport:
@@ -175,7 +181,7 @@ def _from_volumes(scene: Scene, surfaces: Surfaces, sources: VolumeSources) -> L
     (where,) = np.nonzero(known.ravel())
     found = volume_light(scene, sources, scene.lattice.centers().reshape(-1, 3)[where])
     in_voxels = jnp.zeros((scene.bands, known.size), found.dtype).at[:, where].set(found).reshape(-1, *known.shape)
-    in_voxels = fill(in_voxels, jnp.asarray(known, found.dtype)) * jnp.asarray(~surfaces.solid)
+    in_voxels = fill(in_voxels, jnp.asarray(known, found.dtype)) * as_jax(~surfaces.solid)
     return Light(at_elements / jnp.pi, in_voxels / (4 * jnp.pi))
 
 
@@ -185,5 +191,5 @@ def _from_point(scene: Scene, surfaces: Surfaces, light: PointLight) -> Light:
     at_elements = point_light(scene, light, start, surfaces.normal)
     centers = scene.lattice.centers().reshape(-1, 3)
     in_voxels = point_light(scene, light, centers, None, 0.5 * scene.lattice.spacing)
-    in_voxels = in_voxels.reshape(-1, *scene.lattice.shape) * jnp.asarray(~surfaces.solid)
+    in_voxels = in_voxels.reshape(-1, *scene.lattice.shape) * as_jax(~surfaces.solid)
     return Light(at_elements / jnp.pi, in_voxels / (4 * jnp.pi))

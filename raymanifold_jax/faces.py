@@ -128,7 +128,7 @@ def _slope(shapes: tuple, points: Array) -> tuple[Array, Array]:
 
 def _slope_of(shape: Shape, points: Array) -> tuple[Array, list[Array]]:
     # Forwards along each coordinate: quicker here than backwards.
-    axes = [jnp.broadcast_to(jnp.eye(3, dtype=points.dtype)[axis], points.shape) for axis in range(3)]
+    axes = [jnp.broadcast_to(np.eye(3, dtype=points.dtype)[axis], points.shape) for axis in range(3)]
     found = [jax.jvp(shape.distance, (points,), (axis,)) for axis in axes]
     return found[0][0], [rate for _, rate in found]
 
@@ -439,9 +439,9 @@ def _moved(center, patch: Array, value: Array, slope: Array, spacing: float) -> 
     return center[:, None] + patch * spacing, patch
 
 
-def _grid_axes(patch: Array) -> Array:
+def _grid_axes(patch: Array) -> np.ndarray:
     """The axis that each point's grid looks along."""
-    return jnp.asarray(np.repeat(np.eye(3), patch.shape[1] // 3, axis=0))
+    return np.repeat(np.eye(3), patch.shape[1] // 3, axis=0)
 
 
 @jax.jit
@@ -454,7 +454,7 @@ def _curved_area(normal, patch: Array, value: Array, slope: Array) -> Array:
     grid, count = _grid_axes(patch), patch.shape[1] // 3
     size = jnp.abs(dot(slope, grid))
     # The part of a point's cell, over which the surface rises as it slopes there, that is in the voxel.
-    rise = (dot(jnp.abs(slope), jnp.ones(3)) - size) / jnp.maximum(size, 1e-6) / np.sqrt(count)
+    rise = (dot(jnp.abs(slope), np.ones(3)) - size) / jnp.maximum(size, 1e-6) / np.sqrt(count)
     below = 0.5 - jnp.abs(dot(patch, grid))
     inside = jnp.clip(0.5 + (below + 1e-6) / jnp.maximum(rise, 1e-6), 0.0, 1.0)
     same = (jnp.abs(value) < _AT_SURFACE) & (dot(slope, normal[:, None]) > 0.7)

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import checks
+from .arrays import as_jax, numpy_or_jax, worked_out_now
 from .cubature import mean_of_rays
 from .direct import sky_radiance
 from .directions import gathering
@@ -191,7 +192,7 @@ def outgoing_flux(solution: Solution, side: str) -> Float[Array, "nu nv *bands"]
         checks.fail("side", got, "an OPEN side", "no light leaves through others; make it OPEN in Boundary(...)")
     kept = np.nonzero(elements.open & (elements.side == number))[0]
     u, v = (axis for axis in range(3) if axis != number // 2)
-    share = jnp.asarray(elements.area[kept] / scene.lattice.spacing**2, solution.diffuse_irradiance.dtype)
+    share = as_jax(elements.area[kept] / scene.lattice.spacing**2, solution.diffuse_irradiance.dtype)
     values = (solution.diffuse_irradiance + solution.sun_irradiance)[:, kept] * share
     flux = jnp.zeros((scene.lattice.shape[u], scene.lattice.shape[v], scene.bands), values.dtype)
     flux = flux.at[elements.voxel[kept, u], elements.voxel[kept, v]].add(values.T)
@@ -211,7 +212,8 @@ def _light_field(solution: Solution) -> LightField:
     scene, bands = solution.scene, solution.scene.bands
     owners = [*scene.solids, *(side if isinstance(side, Wall) else None for side in scene.boundary.sides)]
     real = solution.diffuse_irradiance.dtype
-    spread = lambda o, name: jnp.broadcast_to(jnp.asarray(0.0 if o is None else getattr(o, name), real), (bands,))
+    xp = numpy_or_jax(owners)
+    spread = lambda o, name: xp.broadcast_to(xp.asarray(0.0 if o is None else getattr(o, name), real), (bands,))
     diffuse = fill(solution.diffuse_fluence, solution.free)
     table = keep((solution.elements,), "element table", lambda: element_table(scene, solution.elements))
     values = solution.diffuse_irradiance.T if len(solution.elements) else jnp.zeros((1, bands), real)
@@ -222,8 +224,8 @@ def _light_field(solution: Solution) -> LightField:
         table=table,
         irradiance=values,
         slope=slopes(scene, table, values),
-        albedo=jnp.stack([spread(None if o is None or isinstance(o.albedo, Texture) else o, "albedo") for o in owners]),
-        emission=jnp.stack([spread(o, "emission") for o in owners]),
+        albedo=as_jax(xp.stack([spread(None if o is None or isinstance(o.albedo, Texture) else o, "albedo") for o in owners])),
+        emission=as_jax(xp.stack([spread(o, "emission") for o in owners])),
     )
 
 
@@ -371,7 +373,7 @@ def _lift(scene: Scene, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     _check_depth(scene, "points", points, _DEEP, "on a surface", advice)
     spacing = lattice.spacing
     for _ in range(2 if len(points) and scene.solids else 1):
-        with jax.ensure_compile_time_eval():
+        with worked_out_now():
             near = (
                 np.asarray(in_blocks(Scene.distance, _untraced(scene), (points,)), np.float64) if len(points) else np.zeros(0)
             )

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .arrays import as_jax, real_dtype
 from .scene import PERIODIC, Scene
 from .surfaces import Surfaces
 from .unfolding import in_blocks
@@ -44,7 +45,7 @@ class ElementTable(eqx.Module):
 
 def element_table(scene: Scene, surfaces: Surfaces) -> ElementTable:
     """The elements of solids and walls by voxel; those of open sides are left out."""
-    real = jnp.zeros(0).dtype
+    real = real_dtype()
     shape, number = np.asarray(scene.lattice.shape), max(len(surfaces), 1)
     kept = np.nonzero(~surfaces.open)[0]
     kept = kept[np.lexsort(surfaces.voxel[kept].T[::-1])]
@@ -67,7 +68,7 @@ def element_table(scene: Scene, surfaces: Surfaces) -> ElementTable:
     if not len(surfaces):
         position = np.zeros((1, 3))
     normal = surfaces.normal if len(surfaces) else np.zeros((1, 3))
-    return ElementTable(jnp.asarray(row), jnp.asarray(around), jnp.asarray(position, real), jnp.asarray(normal, real))
+    return ElementTable(as_jax(row), as_jax(around), as_jax(position, real), as_jax(normal, real))
 
 
 def slopes(scene: Scene, table: ElementTable, values: Float[Array, "E C"]) -> Float[Array, "E C 3"]:

@@ -62,7 +62,7 @@ class System(eqx.Module):
     def bounce(self, leaving: Light) -> tuple[Light, Light]:
         """The light that arrives, of what leaves; and what of it leaves again."""
         arriving = self.transport(leaving, fluence=self.scatters, scattered=True)
-        return arriving, _reflected(self.materials, arriving)
+        return arriving, self.materials.reflected(arriving)
 
     def precondition(self, leaving: Light) -> Light:
         """About the solution of (I - K) x = leaving, without a sweep."""
@@ -97,7 +97,7 @@ def certify(system: System) -> Certificate:
     if system.near is None or largest <= _PLAIN:
         return _by_powers(system, albedo)
     # Where nothing is reflected x is exact, and w may be 0.
-    ones = jax.tree.map(lambda a: jnp.where(a > 0, 1.0, 0.0).astype(a.dtype), albedo)
+    ones = _where_any(albedo)
     shortfall = lambda residual: float(_most_positive(residual))
     apply = lambda light: system.bounce(light)[1]
     w, residual, count = linear_solve(apply, ones, system.precondition, lambda r: shortfall(r) <= 1 - _ENOUGH, _SEARCH)
@@ -108,12 +108,22 @@ def certify(system: System) -> Certificate:
     # What the float type cannot tell from light that bounces without loss.
     lossless = 0.1 / (_ROUNDING * float(jnp.finfo(w.elements.dtype).eps))
     if factor <= min(from_rows, lossless):
-        return Certificate(factor, count, "", w, jax.tree.map(jnp.subtract, ones, residual))
+        return Certificate(factor, count, "", w, _differences(ones, residual))
     if from_rows <= lossless:
-        return Certificate(from_rows, count, "", ones, jax.tree.map(lambda one, a: one * (1 - a), ones, albedo))
+        return Certificate(from_rows, count, "", ones, _differences(ones, albedo))
     return Certificate(
         math.inf, count, f"as far as {w.elements.dtype} can tell in {count} sweeps, some light bounces without loss"
     )
+
+
+@jax.jit
+def _where_any(light: Light) -> Light:
+    return jax.tree.map(lambda a: jnp.where(a > 0, 1.0, 0.0).astype(a.dtype), light)
+
+
+@jax.jit
+def _differences(one: Light, other: Light) -> Light:
+    return jax.tree.map(jnp.subtract, one, other)
 
 
 @eqx.filter_jit
@@ -123,7 +133,7 @@ def _most_positive(light: Light):
 
 def _by_powers(system: System, total: Light) -> Certificate:
     """w = 1 + K 1 + K^2 1 + ..., until every path of light has had a chance to end; one sweep where albedos are moderate."""
-    ones = total = jax.tree.map(lambda a: jnp.where(a > 0, 1.0, 0.0).astype(a.dtype), total)
+    ones = total = _where_any(total)
     power = system.bounce(total)[1]
     count = 1
     while float(power.largest()) > _CERTAIN and count < _POWERS:
@@ -132,7 +142,7 @@ def _by_powers(system: System, total: Light) -> Certificate:
     left = float(power.largest())
     if left >= 1 - 1e-6:
         return Certificate(math.inf, count, f"some light bounces {count} times without loss")
-    slack = jax.tree.map(jnp.subtract, ones, power)
+    slack = _differences(ones, power)
     return Certificate(float(total.largest()) / (1 - left) - 1, count, "", total, slack)
 
 
@@ -148,11 +158,6 @@ def _bounded(weights: Light, slack: Light, residual: Light, u: Light, passed: Li
         return _most_positive(jax.tree.map(lambda r, u, w: a * u + t * w - r, size, u, weights))
 
     return jnp.min(jax.lax.map(bound, jnp.linspace(0.0, 2.0, 21, dtype=residual.elements.dtype)))
-
-
-@eqx.filter_jit
-def _reflected(stuff: Materials, arriving: Light) -> Light:
-    return stuff.reflected(arriving)
 
 
 class Iteration:

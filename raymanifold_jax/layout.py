@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from .arrays import as_jax, numpy_or_jax_of, real_dtype
 from .quadrature import Quadrature
 from .scene import MIRROR, Scene
 from .surfaces import Surfaces
@@ -39,17 +40,19 @@ class Unfolding(eqx.Module):
         return tuple(axis for axis in range(3) if len(self.blocks[axis]) > 1)
 
     def unfold(self, field: Float[Array, "C nx ny nz"]) -> Float[Array, "C X Y Z"]:
+        xp = numpy_or_jax_of(field)
         for axis in self.axes:
-            parts = [jnp.flip(field, axis + 1) if mirrored else field for mirrored in self.blocks[axis]]
-            field = jnp.concatenate(parts, axis + 1)
+            parts = [xp.flip(field, axis + 1) if mirrored else field for mirrored in self.blocks[axis]]
+            field = xp.concatenate(parts, axis + 1)
         return field
 
     def fold(self, field: Float[Array, "C X Y Z"]) -> Float[Array, "C nx ny nz"]:
         """Sum over the images: the transpose of `unfold`."""
+        xp = numpy_or_jax_of(field)
         for axis in self.axes:
-            parts = jnp.split(field, len(self.blocks[axis]), axis + 1)
-            turned = [jnp.flip(p, axis + 1) if m else p for p, m in zip(parts, self.blocks[axis], strict=True)]
-            field = jnp.stack(turned).sum(0)
+            parts = xp.split(field, len(self.blocks[axis]), axis + 1)
+            turned = [xp.flip(p, axis + 1) if m else p for p, m in zip(parts, self.blocks[axis], strict=True)]
+            field = xp.stack(turned).sum(0)
         return field
 
     def images(self) -> list[tuple[tuple[int, ...], np.ndarray]]:
@@ -107,7 +110,7 @@ class Layout(eqx.Module):
 
     def to_padded(self, field: Float[Array, "C nx ny nz"]) -> Float[Array, "C X Y Z"]:
         """Unfold a field of the scene's lattice and give it ghost voxels (0)."""
-        return jnp.pad(self.unfolding.unfold(field), ((0, 0), *((p, p) for p in self.pad)))
+        return numpy_or_jax_of(field).pad(self.unfolding.unfold(field), ((0, 0), *((p, p) for p in self.pad)))
 
     def from_padded(self, field: Float[Array, "C X Y Z"]) -> Float[Array, "C nx ny nz"]:
         inner = tuple(slice(p, n - p) for p, n in zip(self.pad, self.padded, strict=True))
@@ -155,8 +158,11 @@ def flat_planes(field: Float[Array, "*C X Y Z"], axis: int) -> Float[Array, "K *
     return turned.reshape(*turned.shape[:-2], -1)
 
 
-def picked(values: Array, index: Int[Array, " M"]) -> Array:
+def picked(values: Array | np.ndarray, index: Int[Array, " M"]) -> Array:
     """values[..., index]; zeros where a scene has no elements to pick from, and rows of reads only pad."""
+    if isinstance(values, np.ndarray):
+        index = np.asarray(index)
+        return as_jax(values[..., index] if values.shape[-1] else np.zeros((*values.shape[:-1], len(index)), values.dtype))
     return values[..., index] if values.shape[-1] else jnp.zeros((*values.shape[:-1], len(index)), values.dtype)
 
 
@@ -199,7 +205,7 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
     is_open = surfaces.open[element]
     inflow[flat[is_open]] = image_number[is_open]
     blocked = np.pad(
-        np.asarray(unfolding.unfold(jnp.asarray(surfaces.solid[None])))[0],
+        unfolding.unfold(surfaces.solid[None])[0],
         [(p, p) for p in pad],
         constant_values=True,
     )
@@ -209,7 +215,7 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
     probing = ~blocked[tuple(probe.T)]
     rows = {"element": element, "image": np.arange(len(flat)), "offset": offset, "normal": normal, "away": np.zeros_like(away)}
     probes = {key: value[probing] for key, value in (rows | {"away": away}).items()}
-    real = np.dtype(jnp.zeros(0).dtype)
+    real = real_dtype()
     return Layout(
         unfolding=unfolding,
         shape=lattice.shape,
@@ -217,13 +223,13 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
         pad=pad,
         spacing=lattice.spacing,
         elements=len(surfaces),
-        plane=jnp.asarray(plane, real),
-        cell=jnp.asarray(flat, np.int32),
-        face=jnp.asarray(np.column_stack([offset, normal]).T, real),
-        source_element=jnp.asarray(element, np.int32),
-        share=jnp.asarray(area / np.maximum(total[flat], 1e-300), real),
-        buried=jnp.asarray(blocked & ~ghost),
-        inflow_image=jnp.asarray(inflow.reshape(padded), np.int32),
+        plane=as_jax(plane, real),
+        cell=as_jax(flat, np.int32),
+        face=as_jax(np.column_stack([offset, normal]).T, real),
+        source_element=as_jax(element, np.int32),
+        share=as_jax(area / np.maximum(total[flat], 1e-300), real),
+        buried=as_jax(blocked & ~ghost),
+        inflow_image=as_jax(inflow.reshape(padded), np.int32),
         reads=tuple(
             AxisReads(hits, other)
             for hits, other in zip(_reads(padded, rows, voxel, real), _reads(padded, probes, probe[probing], real), strict=True)
@@ -297,7 +303,7 @@ def _axis_reads(
     def spread(values, dtype):
         out = np.zeros((*values.shape[1:], total), dtype)
         out[..., row] = np.moveaxis(values[order], 0, -1)
-        return jnp.asarray(out)
+        return as_jax(out)
 
     return Reads(
         cell=spread(flat(voxel), np.int32),
@@ -305,7 +311,7 @@ def _axis_reads(
         plane=tuple(spread(values, real) for values in (rows["offset"], *rows["normal"].T[[axis, u, v]])),
         height=spread(rows["offset"] + np.einsum("mi,mi->m", rows["normal"], rows["away"]), real),
         image=spread(rows["image"], np.int32),
-        first_tile=jnp.asarray(first_tile, np.int32),
+        first_tile=as_jax(first_tile, np.int32),
         tile=tile,
     )
 
@@ -367,9 +373,9 @@ def _axis_ordinates(quadrature: Quadrature, axis: int, groups: dict, size: int, 
         swap = np.abs(slope[row, :n, 1]) > np.abs(slope[row, :n, 0])
         offset = np.where(swap[:, None], offset[:, ::-1], offset)
         start[row, :n] = np.where(slope[row, :n] < 0, 1 - offset, offset)
-    real = np.dtype(jnp.zeros(0).dtype)
+    real = real_dtype()
     return Ordinates(
-        direction=jnp.asarray(direction, real), weight=jnp.asarray(weight, real), slope=jnp.asarray(slope, real),
-        start=jnp.asarray(start, real), index=jnp.asarray(index, np.int32),
-        sign=jnp.asarray(signs), laps=jnp.ones(count, np.int32), chunks=jnp.asarray(len(chunks), np.int32),
+        direction=as_jax(direction, real), weight=as_jax(weight, real), slope=as_jax(slope, real),
+        start=as_jax(start, real), index=as_jax(index, np.int32),
+        sign=as_jax(signs), laps=as_jax(np.ones(count, np.int32)), chunks=as_jax(len(chunks), np.int32),
     )  # fmt: skip

@@ -25,6 +25,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from . import checks
+from .arrays import as_jax, numpy_or_jax, real_dtype, worked_out_now
 from .lattice import Lattice
 from .layout import Layout, Ordinates, make_ordinates
 from .partition import Partition
@@ -56,15 +57,25 @@ class Light(eqx.Module):
     voxels: Float[Array, "C nx ny nz"] | None = None
 
     def __add__(self, other: Light) -> Light:
-        voxels = other.voxels if self.voxels is None else self.voxels
-        if self.voxels is not None and other.voxels is not None:
-            voxels = self.voxels + other.voxels
-        return Light(self.elements + other.elements, voxels)
+        return _sum(self, other)
 
     def largest(self) -> Float[Array, ""]:
         """The largest magnitude anywhere."""
-        parts = [self.elements] if self.voxels is None else [self.elements, self.voxels]
-        return jnp.stack([jnp.max(jnp.abs(p), initial=0.0) for p in parts]).max()
+        return _largest(self)
+
+
+@eqx.filter_jit
+def _sum(one: Light, other: Light) -> Light:
+    voxels = other.voxels if one.voxels is None else one.voxels
+    if one.voxels is not None and other.voxels is not None:
+        voxels = one.voxels + other.voxels
+    return Light(one.elements + other.elements, voxels)
+
+
+@eqx.filter_jit
+def _largest(light: Light) -> Float[Array, ""]:
+    parts = [light.elements] if light.voxels is None else [light.elements, light.voxels]
+    return jnp.stack([jnp.max(jnp.abs(p), initial=0.0) for p in parts]).max()
 
 
 class Materials(eqx.Module):
@@ -79,46 +90,52 @@ class Materials(eqx.Module):
 
     def reflected(self, arriving: Light) -> Light:
         """What surfaces reflect and the medium scatters of the light that arrives."""
-        voxels = None
-        if self.scattering_albedo is not None and arriving.voxels is not None:
-            voxels = self.scattering_albedo * arriving.voxels
-        return Light(self.albedo * arriving.elements, voxels)
+        scatters = self.scattering_albedo is not None and arriving.voxels is not None
+        by = Light(self.albedo, self.scattering_albedo if scatters else None)
+        return _times(by, Light(arriving.elements, arriving.voxels if scatters else None))
+
+
+@jax.jit
+def _times(one: Light, other: Light) -> Light:
+    return jax.tree.map(jnp.multiply, one, other)
 
 
 def materials(scene: Scene, surfaces: Surfaces) -> Materials:
     """The scene's materials on its elements and voxels; differentiable in every value."""
     bands = scene.bands
-    real = jnp.zeros(0).dtype
-    spread = lambda value: jnp.broadcast_to(jnp.asarray(value, real), (bands,))
-    none = jnp.zeros((bands,), real)
+    real = real_dtype()
+    xp = numpy_or_jax(scene)
+    spread = lambda value: xp.broadcast_to(xp.asarray(value, real), (bands,))
+    none = np.zeros((bands,), real)
     owners = [*scene.solids, *(side if isinstance(side, Wall) else None for side in scene.boundary.sides)]
     plain = [none if o is None or isinstance(o.albedo, Texture) else spread(o.albedo) for o in owners]
-    emission = jnp.stack([none if o is None else spread(o.emission) for o in owners], axis=1)
-    owner = jnp.asarray(surfaces.material, np.int32)
-    albedo = jnp.stack(plain, axis=1)[:, owner]
+    emission = xp.stack([none if o is None else spread(o.emission) for o in owners], axis=1)
+    owner = surfaces.material
+    albedo = xp.stack(plain, axis=1)[:, owner]
     for number, o in enumerate(owners):
         if o is not None and isinstance(o.albedo, Texture):
             rows = np.nonzero(surfaces.material == number)[0]
             points, weight = _face_points(scene.lattice, surfaces, rows)
-            albedo = albedo.at[:, rows].set(mean_values(o.albedo, scene.lattice, points, weight, bands))
+            values = mean_values(o.albedo, scene.lattice, points, weight, bands)
+            albedo = jnp.asarray(albedo).at[:, rows].set(values)
     medium = dict.fromkeys(("scattering_albedo", "medium_source", "extinction", "absorption"))
     if scene.medium is not None:
         shape = (*scene.lattice.shape, bands)
-        outside = jnp.asarray(~surfaces.solid)
-        fields = [jnp.moveaxis(jnp.broadcast_to(c, shape), -1, 0) for c in scene.medium.coefficients()]
-        scattering, absorption, source = (jnp.where(outside, f, 0.0).astype(real) for f in fields)
+        coefficients = jax.tree.map(xp.asarray, scene.medium).coefficients()
+        fields = [xp.moveaxis(xp.broadcast_to(c, shape), -1, 0) for c in coefficients]
+        scattering, absorption, source = (xp.where(surfaces.solid, 0.0, f).astype(real) for f in fields)
         # A voxel that neither absorbs nor scatters has no source function: give it a trace of absorption if it emits, or may
         # become one that does or scatters.
         trace = _TRACE / scene.lattice.spacing
         needed = (source > 0) | checks.is_traced(scene.medium)
-        absorption = absorption + jnp.where(needed & (scattering + absorption < trace), trace, 0.0)
+        absorption = absorption + xp.where(needed & (scattering + absorption < trace), trace, 0.0).astype(real)
         extinction = scattering + absorption
-        divisor = jnp.where(extinction > 0, extinction, 1.0)
+        divisor = xp.where(extinction > 0, extinction, 1.0).astype(real)
         medium = {
             "scattering_albedo": scattering / divisor, "medium_source": source / divisor, "extinction": extinction,
             "absorption": absorption,
         }  # fmt: skip
-    return Materials(albedo, emission[:, owner], **medium)
+    return jax.tree.map(as_jax, Materials(albedo, emission[:, owner], **medium))
 
 
 def _face_points(lattice: Lattice, surfaces: Surfaces, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -187,14 +204,9 @@ def _balance(transport: Transport, area: Float[Array, " E"]) -> Transport:
     exact, not the columns, which are some percent off next to concave corners. Sinkhorn's iteration scales both in turn: the
     transposed sweep tells the columns' sums, the furnace the rows'.
     """
-    layout, extinction = transport.layout, transport.extinction
-    images = len(layout.unfolding.images())
-    power = Light(jnp.broadcast_to(jnp.pi * area, transport.element_sums.shape))
-    sums = Light(transport.element_sums)
+    extinction = transport.extinction
+    power, sums = _powers(transport, area), Light(transport.element_sums)
     if extinction is not None:
-        weight = sum(jnp.sum(o.weight) for o in transport.ordinates)
-        volume = transport.coverage * (4 * jnp.pi / weight * layout.spacing**3 / images)
-        power = Light(power.elements, layout.from_padded(extinction) / images * volume)
         sums = Light(sums.elements, transport.voxel_sums)
     factors = jax.tree.map(jnp.ones_like, power)
     for beyond in _ROUNDS_IN_VACUUM if extinction is None else _ROUNDS_IN_MEDIUM:
@@ -207,6 +219,18 @@ def _balance(transport: Transport, area: Float[Array, " E"]) -> Transport:
             sums = sums if extinction is not None else Light(sums.elements)
     sums = _furnace(transport, factors) if extinction is None else sums
     return dataclasses.replace(transport, element_sums=sums.elements, voxel_sums=sums.voxels, factors=factors)
+
+
+@eqx.filter_jit
+def _powers(transport: Transport, area: Float[Array, " E"]) -> Light:
+    """At elements and in voxels, for a mean radiance of 1."""
+    layout, images = transport.layout, len(transport.layout.unfolding.images())
+    power = jnp.broadcast_to(jnp.pi * area, transport.element_sums.shape)
+    if transport.extinction is None:
+        return Light(power)
+    weight = sum(jnp.sum(o.weight) for o in transport.ordinates)
+    volume = transport.coverage * (4 * jnp.pi / weight * layout.spacing**3 / images)
+    return Light(power, layout.from_padded(transport.extinction) / images * volume)
 
 
 @jax.jit
@@ -259,11 +283,18 @@ def _furnace(transport: Transport, leaving: Light) -> Light:
     """The sums at elements and, outside solids, in voxels for light of 1, or in proportion to it."""
     sums = _sweep(transport, leaving, None, True)
     assert sums.voxels is not None
-    return Light(sums.elements, jnp.where(_solid(transport.layout), 0.0, sums.voxels))
+    return Light(sums.elements, _outside(transport.layout, sums.voxels))
 
 
-def _solid(layout: Layout | Partition) -> Array:
-    return layout.from_padded(layout.buried[None].astype(layout.plane.dtype))[0] > 0
+@eqx.filter_jit
+def _outside(layout: Layout | Partition, voxels: Array) -> Array:
+    solid = layout.from_padded(layout.buried[None].astype(layout.plane.dtype))[0] > 0
+    return jnp.where(solid, 0.0, voxels)
+
+
+@eqx.filter_jit
+def _thickest(extinction: Array, spacing: float) -> Array:
+    return lax.stop_gradient(jnp.max(extinction)) * spacing
 
 
 def make_transport(
@@ -285,8 +316,7 @@ def make_transport(
     **Raises** `ValueError` where rays along a periodic axis never end.
     """
     # What no parameter moves is worked out now, even while JAX stages the rest.
-    late = checks.is_traced(jnp.zeros(())) and not checks.is_traced((extinction, albedo))
-    with jax.ensure_compile_time_eval() if late else nullcontext():
+    with nullcontext() if checks.is_traced((extinction, albedo)) else worked_out_now():
         return _make_transport(layout, quadrature, extinction, bands, beam, area, albedo)
 
 
@@ -295,10 +325,11 @@ def _make_transport(
 ) -> Transport:
     if not beam and layout.unfolding.axes:
         quadrature = quadrature.mirrored(layout.unfolding.axes)
-    with jax.ensure_compile_time_eval():
+    with worked_out_now():
         ordinates = mark_over(layout, make_ordinates(quadrature, bands, plane_size(layout)))
     padded = None if extinction is None else layout.to_padded(extinction)
-    thickest = None if extinction is None else lax.stop_gradient(jnp.max(extinction)) * layout.spacing
+    thickest = None if extinction is None else _thickest(extinction, layout.spacing)
+    thickest = thickest if thickest is None or checks.is_traced(thickest) else np.asarray(thickest)
     # Programs differ by these: where the extinction is not known yet, by the one that always serves.
     thin = thickest is not None and checks.surely(thickest * np.sqrt(3) <= thin_limit(thickest.dtype))
     thick = thickest is not None and not checks.surely(thickest <= THIN)
@@ -309,7 +340,7 @@ def _make_transport(
                 f"boundary: some rays are still going after {_MOST_LAPS} laps of a periodic axis; expected every ray to meet "
                 "a surface, an open side or an absorbing medium; close or open another side, or add absorption"
             )
-    ones = lambda *shape: jnp.ones((bands, *shape), layout.plane.dtype)
+    ones = lambda *shape: as_jax(np.ones((bands, *shape), layout.plane.dtype))
     transport = Transport(layout, ordinates, padded, ones(), ones(), ones(), thin, thick and not beam)
     leaving = Light(ones(layout.elements), None if extinction is None else ones(*layout.shape))
     sums = _furnace(transport, stored(layout, leaving))
@@ -319,7 +350,7 @@ def _make_transport(
     if area is not None and extinction is None and isinstance(layout, Layout) and worth_linking(layout, len(quadrature)):
         transport = dataclasses.replace(transport, links=find_links(layout, ordinates))
     if area is not None:
-        transport = _balance(transport, jnp.asarray(area, layout.plane.dtype))
+        transport = _balance(transport, as_jax(area, layout.plane.dtype))
     if thick and albedo is not None:
         factor = 1.0 if transport.factors is None or transport.factors.voxels is None else transport.factors.voxels
         transport = dataclasses.replace(transport, albedo=albedo * factor, thin=False)

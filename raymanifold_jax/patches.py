@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from . import checks
+from .arrays import worked_out_now
 from .directions import frames
 from .emitters import CLEARANCE, SMALL, EmittingFaces, emitting_faces, share_that_emits
 from .march import transmittance_unfolded
@@ -231,7 +232,7 @@ def _arriving(
     for begin in range(0, len(receiver), _BLOCK):
         facing, share = (values[begin : begin + _BLOCK] for values in (normal, weight))
         start = position[begin : begin + _BLOCK] + CLEARANCE * facing
-        with jax.ensure_compile_time_eval():
+        with worked_out_now():
             pairs = _seen(still, patches, start, facing)
         unattenuated.append(share * np.bincount(pairs.element, pairs.geometry, len(start)))
         parts.append(_light(scene, patches, pairs, start, radiance) * jnp.asarray(share, radiance.dtype))

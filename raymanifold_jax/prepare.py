@@ -17,6 +17,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from . import checks
+from .arrays import worked_out_now
 from .layout import Layout, make_layout
 from .partition import Partition, make_partition
 from .placement import known
@@ -64,6 +65,6 @@ class Prepared:
 def prepare(scene: Scene) -> Prepared:
     """Sample the geometry of a scene; its values are not looked at."""
     # Known even while JAX traces values.
-    with jax.ensure_compile_time_eval():
+    with worked_out_now():
         surfaces = find_surfaces(scene)
         return Prepared(surfaces, make_layout(scene, surfaces))

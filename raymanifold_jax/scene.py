@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from . import checks
+from .arrays import as_jax, real_dtype
 from .lattice import Lattice
 from .shapes import Shape, least, safe_norm
 from .texture import Texture
@@ -301,7 +302,7 @@ class Scene(eqx.Module):
             elif isinstance(light, PointLight):
                 yield from _last_axis(f"lights[{i}].intensity", light.intensity, (1,))
             elif callable(light.radiance):
-                directions = jax.ShapeDtypeStruct((2, 3), jnp.zeros(0).dtype)
+                directions = jax.ShapeDtypeStruct((2, 3), real_dtype())
                 radiance = eqx.filter_eval_shape(light.radiance_along, directions)
                 yield from _last_axis(f"lights[{i}].radiance", radiance, (2,))
             else:
@@ -368,7 +369,7 @@ def _last_axis(name: str, value: Any, ranks: tuple[int, ...]) -> Iterator[tuple[
 
 
 def _leaf(value: checks.Numbers) -> jax.Array:
-    return jnp.asarray(value, dtype=float)
+    return as_jax(value, float) if isinstance(value, jax.Array) else as_jax(np.array(value, real_dtype()))
 
 
 def _albedo(albedo: Any) -> Any:

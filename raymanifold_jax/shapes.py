@@ -54,7 +54,7 @@ def least(values: tuple[Float[jax.Array, "*batch"], ...]) -> Float[jax.Array, "*
 @least.defjvp
 def _(primals, tangents):
     (values,), (rates,) = primals, tangents
-    found, total, count = values[0], rates[0], jnp.ones_like(values[0])
+    found, total, count = values[0], rates[0], 1.0
     # Each against the least so far, not against the least of all: that one may be rounded another way where XLA repeats it.
     for value, rate in zip(values[1:], rates[1:], strict=True):
         lower, upper = value < found, value > found

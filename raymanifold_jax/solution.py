@@ -52,9 +52,13 @@ class Energy(NamedTuple):
 
     @property
     def imbalance(self) -> Float[jax.Array, ""]:
-        put_in = self.emitted + self.entering
-        got_out = self.absorbed_by_surfaces + self.absorbed_by_medium + self.leaving
-        return (put_in - got_out) / jnp.where(put_in > 0, put_in, 1.0)
+        return _imbalance(*self)
+
+
+@jax.jit
+def _imbalance(emitted, entering, *taken) -> Float[jax.Array, ""]:
+    put_in = emitted + entering
+    return (put_in - sum(taken)) / jnp.where(put_in > 0, put_in, 1.0)
 
 
 @dataclasses.dataclass(frozen=True)

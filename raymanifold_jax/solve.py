@@ -19,9 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.sharding import Mesh
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from . import checks
+from .arrays import as_jax, numpy_or_jax, real_dtype, worked_out_now
 from .acceleration import make_diffusion
 from .checkpoint import Checkpoint
 from .direct import first_flight, sky_radiance
@@ -110,7 +111,7 @@ def solve(
         prepared = prepare(scene) if prepared is None else prepared
         surfaces = prepared.surfaces
         layout = prepared.layout_on(mesh if cube is None else None)
-        with jax.ensure_compile_time_eval():  # of what is known while JAX stages the rest
+        with worked_out_now():
             check_sources(scene, surfaces)
         stuff = materials(scene, surfaces)
         _check_steady(scene, surfaces, stuff)
@@ -236,8 +237,12 @@ def _depth(stuff: Materials, spacing: float) -> float:
     """The largest optical depth along an axis of the lattice, or a little more."""
     if stuff.extinction is None:
         return 0.0
-    along = [float(jnp.max(jnp.sum(stuff.extinction, axis))) for axis in (1, 2, 3)]
-    return max(along) * spacing
+    return float(_longest(stuff.extinction)) * spacing
+
+
+@jax.jit
+def _longest(extinction: Float[Array, "C nx ny nz"]) -> Float[Array, ""]:
+    return jnp.stack([jnp.max(jnp.sum(extinction, axis)) for axis in (1, 2, 3)]).max()
 
 
 def _exchanges(scene: Scene, stuff: Materials) -> bool:
@@ -280,10 +285,10 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
             got = f"what was prepared for {prepared.layout.shape} voxels"
             checks.fail("prepared", got, f"the scene's {scene.lattice.shape}", "prepare the scene itself")
     checks.positive_int("max_sweeps", max_sweeps)
-    finest = 16 * float(jnp.finfo(jnp.zeros(0).dtype).eps)
+    finest = 16 * float(jnp.finfo(real_dtype()).eps)
     if not (isinstance(rtol, (int, float, np.floating)) and math.isfinite(rtol) and finest <= rtol < 1):
         checks.fail(
-            "rtol", repr(rtol), f"a number from {finest:.2g} (what {jnp.zeros(0).dtype} can hold) to 1", "use 1e-3 to 1e-5"
+            "rtol", repr(rtol), f"a number from {finest:.2g} (what {real_dtype()} can hold) to 1", "use 1e-3 to 1e-5"
         )
 
 
@@ -316,7 +321,7 @@ def _finish(
 ) -> Solution:
     system, bounced = iteration.system, iteration.arriving
     # Within its bound a Krylov iterate may dip below 0, where the exact solution is not.
-    bounced = jax.tree.map(lambda x: x + lax.stop_gradient(jnp.maximum(-x, 0.0)), bounced)
+    bounced = _not_negative(bounced)
     if not system.scatters:  # the iteration did not need the light in the voxels
         before = iteration.before if isinstance(iteration, Iteration) and iteration.asked else bounced
         everywhere = jax.tree.map(jnp.zeros_like, system.source)
@@ -325,20 +330,14 @@ def _finish(
         bounced = Light(bounced.elements, everywhere.voxels)
     rest, sun = system.direct.rest + bounced, system.direct.sun
     if nodes is not None:
-        rest, sun, outside = *nodes.at_elements(rest, sun), jnp.asarray(~nodes.solid)
-        free = jnp.where(outside, jnp.ones((), rest.elements.dtype), 0.0)
+        rest, sun, outside = *nodes.at_elements(rest, sun), as_jax(~nodes.solid)
+        free = _where(outside, jnp.ones((), rest.elements.dtype))
     else:
-        covered = system.transport.coverage / _whole(system.transport)
+        covered = _covered(system.transport)
         rest, sun, covered = restored(system.transport.layout, (rest, sun, covered))
-        outside = jnp.asarray(~surfaces.solid)
-        free = jnp.where(outside, covered, 0.0)
-    fluence = lambda light: jnp.where(outside, 4 * jnp.pi * light.voxels, 0.0)
-    fields = {
-        "diffuse_irradiance": jnp.pi * rest.elements,
-        "sun_irradiance": jnp.pi * sun.elements,
-        "diffuse_fluence": fluence(rest),
-        "sun_fluence": fluence(sun),
-    }
+        outside = as_jax(~surfaces.solid)
+        free = _where(outside, covered)
+    fields = _fields(rest, sun, outside)
     return Solution(
         scene=scene, **fields, free=free, albedo=stuff.albedo, emission=stuff.emission,
         energy=_energy(scene, surfaces, quadrature, stuff, free, fields),
@@ -350,29 +349,55 @@ def _finish(
     )  # fmt: skip
 
 
-def _whole(transport: Transport) -> Float[Array, ""]:
-    """The sum of weights that a wholly free voxel gets."""
+@jax.jit
+def _not_negative(light: Light) -> Light:
+    return jax.tree.map(lambda x: x + lax.stop_gradient(jnp.maximum(-x, 0.0)), light)
+
+
+@eqx.filter_jit
+def _covered(transport: Transport) -> Float[Array, "nx ny nz"]:
+    """The share of each voxel that is free: of the sum of weights that a wholly free one gets."""
     weights = jnp.stack([jnp.sum(o.weight) for o in transport.ordinates])
-    return weights.sum() * len(transport.layout.unfolding.images())
+    return transport.coverage / (weights.sum() * len(transport.layout.unfolding.images()))
+
+
+@jax.jit
+def _where(outside: Bool[Array, "nx ny nz"], values: Float[Array, "..."]) -> Float[Array, "nx ny nz"]:
+    return jnp.where(outside, values, 0.0)
+
+
+@jax.jit
+def _fields(rest: Light, sun: Light, outside: Bool[Array, "nx ny nz"]) -> dict[str, Array]:
+    fluence = lambda light: jnp.where(outside, 4 * jnp.pi * light.voxels, 0.0)
+    return {
+        "diffuse_irradiance": jnp.pi * rest.elements,
+        "sun_irradiance": jnp.pi * sun.elements,
+        "diffuse_fluence": fluence(rest),
+        "sun_fluence": fluence(sun),
+    }
 
 
 def _energy(scene: Scene, surfaces: Surfaces, quadrature, stuff: Materials, free, fields) -> Energy:
-    real = free.dtype
-    area = jnp.asarray(surfaces.area, real)
-    is_open = jnp.asarray(surfaces.open)
+    points = [light.intensity for light in scene.lights if isinstance(light, PointLight)]
+    entering, area = _entering(scene, surfaces, quadrature, free.dtype), as_jax(surfaces.area, free.dtype)
+    return _account(stuff, free, fields, points, entering, area, as_jax(surfaces.open), scene.lattice.spacing)
+
+
+@eqx.filter_jit
+def _account(stuff: Materials, free, fields, points, entering, area, is_open, spacing: float) -> Energy:
+    real, bands = free.dtype, len(stuff.albedo)
     irradiance = fields["diffuse_irradiance"] + fields["sun_irradiance"]
     emitted = jnp.sum(jnp.pi * stuff.emission * area)
-    volume = free * scene.lattice.spacing**3
+    volume = free * spacing**3
     in_medium = jnp.zeros((), real)
     if stuff.absorption is not None and stuff.medium_source is not None and stuff.extinction is not None:
         in_medium = jnp.sum(stuff.absorption * (fields["diffuse_fluence"] + fields["sun_fluence"]) * volume)
         emitted = emitted + jnp.sum(4 * jnp.pi * stuff.medium_source * stuff.extinction * volume)
-    for light in scene.lights:
-        if isinstance(light, PointLight):
-            emitted = emitted + 4 * jnp.pi * jnp.sum(jnp.broadcast_to(light.intensity, (scene.bands,)))
+    for intensity in points:
+        emitted = emitted + 4 * jnp.pi * jnp.sum(jnp.broadcast_to(intensity, (bands,)))
     return Energy(
         emitted=emitted,
-        entering=_entering(scene, surfaces, quadrature, real),
+        entering=entering,
         absorbed_by_surfaces=jnp.sum(jnp.where(is_open, 0.0, (1 - stuff.albedo) * irradiance * area)),
         absorbed_by_medium=in_medium,
         leaving=jnp.sum(jnp.where(is_open, irradiance * area, 0.0)),
@@ -381,8 +406,8 @@ def _energy(scene: Scene, surfaces: Surfaces, quadrature, stuff: Materials, free
 
 def _entering(scene: Scene, surfaces: Surfaces, quadrature: Quadrature, real) -> Float[Array, ""]:
     """Power that skies and suns send in through the open sides."""
-    total = jnp.zeros((), real)
-    radiance = sky_radiance(scene, quadrature.directions)
+    total, xp = np.zeros((), real), numpy_or_jax(scene)
+    radiance = xp.asarray(sky_radiance(scene, quadrature.directions))
     for side, kind in enumerate(scene.boundary.sides):
         if kind is not OPEN:
             continue
@@ -392,9 +417,10 @@ def _entering(scene: Scene, surfaces: Surfaces, quadrature: Quadrature, real) ->
         inward[side // 2] = -1.0 if side % 2 else 1.0
         cosine = np.maximum(quadrature.directions @ inward, 0) * quadrature.weights
         cosine *= np.pi / cosine.sum()
-        total = total + area * jnp.sum(radiance @ jnp.asarray(cosine, real))
+        total = total + area * xp.sum(radiance @ cosine.astype(real))
         for light in scene.lights:
             if isinstance(light, Sun):
                 share = max(float(np.asarray(light.direction) @ inward), 0.0)
-                total = total + area * share * jnp.sum(jnp.broadcast_to(light.irradiance, (scene.bands,)))
-    return total
+                irradiance = xp.broadcast_to(xp.asarray(light.irradiance), (scene.bands,))
+                total = total + area * share * xp.sum(irradiance)
+    return as_jax(total, real)

@@ -24,6 +24,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from . import checks
+from .arrays import real_dtype
 from .scene import MIRROR, PERIODIC, Scene
 
 _BLOCK = 1 << 14  # rays a call
@@ -130,7 +131,7 @@ def box_span(scene: Scene, u: Array, w: Array) -> tuple[Array, Array]:
 
 def in_blocks(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
     """function(scene, *arrays) for arrays (n, ...), some rays at a time; results have n as their first axis."""
-    real = jnp.zeros(0).dtype
+    real = real_dtype()
     if checks.is_traced(arrays):
         return _in_bundles(function, scene, tuple(jnp.asarray(a, real) for a in arrays))
     count = len(arrays[0])

@@ -31,6 +31,7 @@ from jaxtyping import Array, Bool, Float
 from scipy import ndimage
 
 from . import checks
+from .arrays import real_dtype
 from .directions import gathering
 from .march import march_between
 from .scene import Scene
@@ -162,7 +163,7 @@ def volume_light(
     rays: int = _RAYS,
 ) -> Float[Array, "C n"]:
     """Irradiance from the sources at surface points, or without normals fluence: straight, attenuated and shadowed."""
-    real = jnp.zeros(0).dtype
+    real = real_dtype()
     positions = np.asarray(positions, np.float64)
     u = (positions - scene.lattice.lower) / scene.lattice.spacing
     u = u if normals is None else u + _OFF * normals

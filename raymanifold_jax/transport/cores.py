@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import checks
+from ..arrays import real_dtype
 from ..layout import Layout, Ordinates
 
 _FEW = 1 << 20  # voxels times directions: less is done before the threads have started
@@ -48,7 +49,7 @@ def each_on_a_core(function: Callable, arguments: Sequence[Any], *program: Any) 
     if key not in _compiled or count_cores() < 2:
         _compiled.add(key)
         return [function(argument) for argument in arguments]
-    long = jnp.zeros(0).dtype == np.float64
+    long = real_dtype() == np.float64
     return list(_pool().map(functools.partial(_as_here, long, function), arguments))
 
 

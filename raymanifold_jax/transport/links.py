@@ -24,6 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ..arrays import as_jax
 from ..layout import AxisReads, Layout, Ordinates, Reads
 from ..memory import LINKS, MOST_LINKS
 from . import native
@@ -78,7 +79,7 @@ class Links(eqx.Module):
         share, number, element = np.asarray(self.share), np.asarray(self.number), np.asarray(self.element)
         voxels = [np.bincount(number, band[element] * share, self.numbers) for band in np.asarray(exitance)]
         found = native.follow(self.rows.element, self.rows.source, self.rows.weight, np.array(voxels), self.elements)
-        return jnp.asarray(found, exitance.dtype)
+        return as_jax(found, exitance.dtype)
 
     def sent(self, asked: Float[Array, "C E"]) -> Float[Array, "C E"]:
         """The transpose of `arriving`."""
@@ -86,7 +87,7 @@ class Links(eqx.Module):
             voxels = native.follow(self.rows.source, self.rows.element, self.rows.weight, np.asarray(asked), self.numbers)
             share, number, element = np.asarray(self.share), np.asarray(self.number), np.asarray(self.element)
             found = [np.bincount(element, band[number] * share, self.elements) for band in voxels]
-            return jnp.asarray(np.array(found), asked.dtype)
+            return as_jax(np.array(found), asked.dtype)
         like = jax.ShapeDtypeStruct(asked.shape, asked.dtype)
         return jax.linear_transpose(lambda exitance: _arriving(self, exitance), like)(asked)[0]
 
@@ -125,14 +126,14 @@ def find_links(layout: Layout, ordinates: tuple[Ordinates, ...]) -> Links:
     numbers[sending] = np.arange(1, len(sending) + 1)
     numbers = numbers.reshape(layout.padded)
     if native.serves(layout, ordinates, ()):
-        rows = _List(*map(jnp.asarray, native.views(layout, ordinates, numbers)))
+        rows = _List(*map(as_jax, native.views(layout, ordinates, numbers)))
     else:
         rows = tuple(_swept_rows(layout, ordinates, numbers))
     return Links(
         rows=rows,
         element=layout.source_element,
         share=layout.share,
-        number=jnp.asarray(number + 1, np.int32),
+        number=as_jax(number + 1, np.int32),
         numbers=len(sending) + 1,
         elements=layout.elements,
     )
@@ -160,7 +161,7 @@ def _packed(row: np.ndarray, source: np.ndarray, weight: np.ndarray, element: Ar
     sources = np.zeros((count.max(), len(used)), np.int32)
     weights = np.zeros(sources.shape, weight.dtype)
     sources[slot, column], weights[slot, column] = source, weight
-    return _Rows(jnp.asarray(sources), jnp.asarray(weights), element[used])
+    return _Rows(as_jax(sources), as_jax(weights), element[used])
 
 
 @eqx.filter_jit  # by axis: in a cubic lattice they share a program
@@ -215,7 +216,7 @@ def _view(seen, plane_number, reads: Reads, bits, own: Ordinates, starts, chords
 
 def _all_views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: Int[np.ndarray, "X Y Z"]) -> Iterator[_View]:
     """In vacuum, chunk by chunk, which voxels' surfaces each read of an element sees, by their `numbers` (1 and up)."""
-    codes = jnp.asarray(numbers, layout.plane.dtype)[None]
+    codes = as_jax(numbers, layout.plane.dtype)[None]
     for axis, (own, reads) in enumerate(zip(ordinates, layout.reads, strict=True)):
         if own.weight.shape[0] == 0:
             continue

@@ -10,6 +10,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int, UInt32
 
@@ -26,21 +27,23 @@ def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinat
     """
 
     found = []
-    planes = jnp.where(layout.buried, -1.0, layout.plane[0]).ravel(), *(layout.plane[1 + a].ravel() for a in range(3))
+    by_machine_code = native.serves(layout, ordinates, ())
+    xp, hit_bits = (np, native.hit_bits) if by_machine_code else (jnp, _hit_bits)
+    buried, plane, faces, cell = map(xp.asarray, (layout.buried, layout.plane, layout.face, layout.cell))
+    planes = xp.where(buried, plane.dtype.type(-1), plane[0]).ravel(), *(plane[1 + a].ravel() for a in range(3))
     strides = (layout.padded[1] * layout.padded[2], layout.padded[2], 1)
-    hit_bits = native.hit_bits if native.serves(layout, ordinates, ()) else _hit_bits
     for axis, (own, reads) in enumerate(zip(ordinates, layout.reads, strict=True)):
         order = AXES[axis]
         geometry = planes[0], *(planes[1 + a] for a in order)
         a, u, v = order
         shape, padded = layout.padded_along(axis), (layout.pad[a] > 0, layout.pad[u] > 0, layout.pad[v] > 0)
-        voxel = jnp.unravel_index(layout.cell, layout.padded)
-        home = jnp.stack([voxel[a] for a in order])
-        face = layout.face[jnp.array([0, *(1 + a for a in order)])]
-        if own.chunks == 0:
-            bits = jnp.zeros((own.weight.shape[0], -(-own.weight.shape[1] // 32), face.shape[1]), jnp.uint32)
+        voxel = xp.unravel_index(cell, layout.padded)
+        home = xp.stack([voxel[a] for a in order])
+        face = faces[np.array([0, *(1 + a for a in order)])]
+        if int(own.chunks) == 0:
+            bits = np.zeros((own.weight.shape[0], -(-own.weight.shape[1] // 32), face.shape[1]), np.uint32)
         else:
-            bits = hit_bits(geometry, jnp.array([strides[a] for a in order]), shape, padded, own, face, home)
+            bits = hit_bits(geometry, np.array([strides[a] for a in order]), shape, padded, own, face, home)
         found.append(own.marked(*(picked(bits, r.image) for r in reads)))
     return tuple(found)
 

@@ -20,11 +20,11 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
 
 from .. import checks
+from ..arrays import as_jax
 from ..keep import keep
 from ..layout import AXES, Layout, Ordinates, Reads
 from .characteristic import Inflow, thin_limit
@@ -103,8 +103,7 @@ def sweep(
     sent = np.asarray(exitance)
     volume = None
     if extinction is not None:
-        dark = jnp.zeros((bands, *layout.shape), real)
-        volume = np.asarray(layout.to_padded(dark if source is None else source))
+        volume = layout.to_padded(np.zeros((bands, *layout.shape), real) if source is None else np.asarray(source))
     slopes = None if volume is None else slopes
     sloped = slopes is not None
     at_elements = np.zeros((bands, layout.elements))
@@ -140,8 +139,8 @@ def sweep(
 
     for line in _lines(manner, layout, ordinates, extinction, bands, sloped, real):
         along(*line)
-    voxels = layout.from_padded(jnp.asarray(in_voxels)) if manner.fluence else None
-    return jnp.asarray(at_elements, real), voxels
+    voxels = as_jax(layout.from_padded(in_voxels)) if manner.fluence else None
+    return as_jax(at_elements, real), voxels
 
 
 def unsweep(
@@ -159,7 +158,7 @@ def unsweep(
     real, bands = np.dtype(at_elements.dtype), at_elements.shape[0]
     medium, asked = extinction is not None, np.asarray(at_elements, float)
     sloped = sloped and medium
-    volume = None if in_voxels is None else np.asarray(layout.to_padded(in_voxels))
+    volume = None if in_voxels is None else layout.to_padded(np.asarray(in_voxels))
     exitance = np.zeros((bands, layout.elements))
     # Of the source, and of its slopes along x, y and z.
     fields = [np.zeros((bands, *layout.padded), real) for _ in range(medium * (1 + 3 * sloped))]
@@ -189,8 +188,8 @@ def unsweep(
 
     for line in _lines(manner, layout, ordinates, extinction, bands, sloped, real):
         along(*line)
-    source = layout.from_padded(jnp.asarray(fields[0])) if medium else None
-    return jnp.asarray(exitance, real), source, tuple(map(jnp.asarray, fields[1:])) if sloped else None
+    source = as_jax(layout.from_padded(fields[0])) if medium else None
+    return as_jax(exitance, real), source, tuple(map(as_jax, fields[1:])) if sloped else None
 
 
 def views(
@@ -261,7 +260,7 @@ def hit_bits(
     ordinates: Ordinates,
     face: Float[Array, "4 I"],
     home: Int[Array, "3 I"],
-) -> UInt32[Array, "G words I"]:
+) -> UInt32[np.ndarray, "G words I"]:
     """As in `marks`: bits of the directions whose rays arrive at each element in its own voxel."""
     from . import machine_code as code
 
@@ -280,7 +279,7 @@ def hit_bits(
         pass
     bits = np.empty_like(found)
     bits[..., order] = found
-    return jnp.asarray(bits)
+    return bits
 
 
 def _lines(manner: Any, layout: Layout, ordinates, extinction, bands: int, sloped: bool, real: np.dtype) -> Iterator[tuple]:

@@ -25,6 +25,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Float, Int
 
 from .. import checks
+from ..arrays import real_dtype
 from ..direct import Direct, _from_point, _from_sun, brightest, sky_radiance
 from ..iteration import System
 from ..layout import make_layout
@@ -164,7 +165,7 @@ def make_cube_system(scene: Scene, surfaces: Surfaces, scheme: LightRayCube, mes
     if mesh is not None:
         lattice, cell = make_ray_partition(lattice, mesh, nodes.cell)
     own = stored(lattice, stuff)
-    real = jnp.zeros(0).dtype
+    real = real_dtype()
     spread = lambda field: lattice.to_padded(stored(lattice, jnp.asarray(field, real)))
     extinction = None if own.extinction is None else lattice.to_padded(own.extinction)
     fields = NodeFields(spread(nodes.normal), spread(~nodes.solid[None]), jnp.zeros((0, 0, 0, 0), real), extinction)

@@ -19,6 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ..arrays import real_dtype
 from ..layout import AXES
 from ..quadrature import cube_points, light_ray_cube
 from ..shift import Torus, hop, hop_around
@@ -56,7 +57,7 @@ def make_faces(half_width: int, rays: int) -> Faces:
         hops[face, :n] = points[members][:, order[1:]]
         length[face, :n] = np.linalg.norm(points[members], axis=1)
         weight[face, :n], index[face, :n] = quadrature.weights[members], members
-    real = np.dtype(jnp.zeros(0).dtype)
+    real = real_dtype()
     split = lambda a, kind: jnp.asarray(a.reshape(6, count, size, *a.shape[2:]), kind)
     return Faces(
         direction=split(direction, real), hop=split(hops, np.int32), length=split(length, real), weight=split(weight, real),

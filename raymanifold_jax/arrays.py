@@ -1,0 +1,48 @@
+"""Arrays of JAX from numbers of the host.
+
+`jnp.asarray` makes a program for every shape that it copies or converts, which takes JAX some milliseconds each at the start
+of every process; here numpy converts. So does every other operation outside of `jit`: numpy does them where numbers are known.
+
+Public: `as_jax`, `real_dtype`, `numpy_or_jax`, `numpy_or_jax_of`, `worked_out_now`.
+"""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager, nullcontext
+from types import ModuleType
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from . import checks
+
+
+def as_jax(values: Any, dtype: Any = None) -> Array:
+    """As `jnp.asarray`."""
+    if isinstance(values, jax.Array) or checks.is_traced(values):
+        return jnp.asarray(values, dtype)
+    return jax.device_put(np.asarray(values, None if dtype is None else jax.dtypes.canonicalize_dtype(dtype)))
+
+
+def real_dtype() -> np.dtype:
+    """Of real numbers as JAX is set up: float32, or float64 with its `enable_x64`."""
+    return np.dtype(jax.dtypes.canonicalize_dtype(float))
+
+
+def numpy_or_jax(*values: Any) -> ModuleType:
+    """`numpy` where all of these are known, `jax.numpy` where JAX traces some."""
+    return jnp if checks.is_traced(values) else np
+
+
+def numpy_or_jax_of(array: Any) -> ModuleType:
+    """The one that this array is of."""
+    return np if isinstance(array, np.ndarray) else jnp
+
+
+def worked_out_now() -> AbstractContextManager:
+    """For what no parameter moves: it is known even while JAX stages the rest."""
+    staging = checks.is_traced(jnp.zeros(()))
+    return jax.ensure_compile_time_eval() if staging else nullcontext()
