@@ -6,8 +6,8 @@ The need in bytes, with V voxels (a layer of ghosts included), C bands, E surfac
 
 C D: the bits that say which directions hit an element. Without a medium there are also links from element to element (see
 `transport.links`), LINKS E D, if these are not more than MOST_LINKS. Where sweeps are XLA's (see `transport.native`), there are
-BUFFERS words a voxel more, and the links are twice as long on their way. The constants are for 32-bit numbers; with them the
-peaks of ring, three balls and the Cornell box at 32, 64 and 128 cubed, 1, 3 and 8 bands, come out within 18 %.
+SWEEPS bytes and BUFFERS words a voxel more, and the links are twice as long on their way. The constants are for 32-bit numbers;
+with them the peaks of ring, three balls and the Cornell box at 32, 64 and 128 cubed, 1, 3 and 8 bands, come out within 14 %.
 
 Public names: `estimate_memory`, `available_memory`, `check_memory`, `gigabytes`.
 """
@@ -16,8 +16,9 @@ import importlib.util
 import os
 from pathlib import Path
 
-PROGRAM = 880_000_000  # Python, JAX, compilation
-BAND = 60_000_000  # work arrays of a batch
+PROGRAM = 540_000_000  # Python, JAX, compilation
+SWEEPS = 150_000_000  # compilation of XLA's sweeps
+BAND = 50_000_000  # work arrays of a batch
 GEOMETRY = 30  # words a voxel: planes, the samples of the signed distance, copies turned to each axis
 FIELDS_VACUUM = 11  # words a voxel and band: sums of a sweep, fluence of sun, sky and bounces
 FIELDS_MEDIUM = 68  # the same, coefficients, source, the multigrid's, and the iteration's unknowns of many sweeps
@@ -42,10 +43,11 @@ def estimate_memory(scene_shape: Shape, bands: int, directions: int, medium: boo
     fields = GEOMETRY + bands * ((FIELDS_MEDIUM if medium else FIELDS_VACUUM) + cores)
     links = 0 if medium else LINKS * elements * directions
     links = links if links <= MOST_LINKS else 0
+    program = PROGRAM
     if importlib.util.find_spec("numba") is None:
-        fields, links = fields + BUFFERS, 2 * links
+        program, fields, links = PROGRAM + SWEEPS, fields + BUFFERS, 2 * links
     voxels = (nx + 2) * (ny + 2) * (nz + 2)
-    return PROGRAM + bands * BAND + 4 * voxels * fields + elements * (ELEMENT + bands * directions) + links
+    return program + bands * BAND + 4 * voxels * fields + elements * (ELEMENT + bands * directions) + links
 
 
 def available_memory() -> int | None:
