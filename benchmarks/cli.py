@@ -283,19 +283,25 @@ def speed(
     quick: bool, sizes: tuple[int, ...], counts: tuple[int, ...], bands: tuple[int, ...], rtol: float, repeats: int,
     json_file: Path | None,
 ) -> None:  # fmt: skip
-    """Time of sweeps, bounces and whole solves, and how it grows with size and directions."""
+    """Time of sweeps, bounces and whole solves, how it grows with size and directions, and what skipped work would take."""
     from .record import environment, write
+    from .skipped import skipped, skipped_table
     from .speed import solves, speed_table, sweeps
 
     sizes = sizes or ((8, 16) if quick else (32, 64))
     counts = counts or ((60,) if quick else (200,))
     records = []
-    for made in (sweeps(sizes, counts, bands, repeats, _tell), solves(sizes, counts[0], rtol, repeats, _tell)):
+    for made in (
+        sweeps(sizes, counts, bands, repeats, _tell),
+        solves(sizes, counts[0], rtol, repeats, _tell),
+        skipped(sizes[len(sizes) // 2], counts[0], rtol, repeats, _tell),
+    ):
         for record in made:
             records.append(record)
             write(json_file, _QUESTIONS["speed"], records, environment=environment())
     _print_environment(environment())
     click.echo(speed_table(records))
+    click.echo("\n" + skipped_table(records))
 
 
 @main.command()

@@ -3,21 +3,25 @@
 `jnp.asarray` makes a program for every shape that it copies or converts, which takes JAX some milliseconds each at the start
 of every process; here numpy converts. So does every other operation outside of `jit`: numpy does them where numbers are known.
 
-Public: `as_jax`, `real_dtype`, `numpy_or_jax`, `numpy_or_jax_of`, `worked_out_now`.
+Public: `as_jax`, `real_dtype`, `numpy_or_jax`, `numpy_or_jax_of`, `worked_out_now`, `stop_gradient`.
 """
 
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array
 
 from . import checks
+
+T = TypeVar("T")
 
 
 def as_jax(values: Any, dtype: Any = None) -> Array:
@@ -46,3 +50,8 @@ def worked_out_now() -> AbstractContextManager:
     """For what no parameter moves: it is known even while JAX stages the rest."""
     staging = checks.is_traced(jnp.zeros(()))
     return jax.ensure_compile_time_eval() if staging else nullcontext()
+
+
+def stop_gradient(tree: T) -> T:
+    """The same numbers without derivatives: known ones, unless `jit` or `vmap` traces them."""
+    return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_inexact_array(a) else a, tree)

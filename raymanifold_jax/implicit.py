@@ -20,9 +20,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -33,6 +32,7 @@ from jaxtyping import Array, Float, Int
 from . import checks
 from .acceleration import Diffusion
 from .adjoint import linear
+from .arrays import stop_gradient
 from .iteration import Certificate, System
 from .krylov import dot, linear_solve, norm
 from .operator import Light, Materials, Transport
@@ -54,11 +54,6 @@ class Unwatched:
         self.bound = self.target = self.rounding = math.nan
         self.residuals, self.sweeps, self.certificate = [math.nan], 0, Certificate(math.nan, 0)
         self.ending, self.solver = "", Krylov(_RESTART, diffusion=False)
-
-
-def stop_gradient(tree: Any) -> Any:
-    """The same numbers without derivatives: known ones, unless `jit` or `vmap` traces them."""
-    return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_inexact_array(a) else a, tree)
 
 
 def attach(system: System, arriving: Light, rtol: float, most: int) -> Light:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,6 +28,7 @@ from .surfaces import Surfaces
 AXES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # sweep axis, u, v
 _CHUNK = 1 << 17  # rays times bands in one step: a compromise between a CPU's caches and the cost of starting a step
 _WORD = 32
+Field = TypeVar("Field", Array, np.ndarray)
 
 
 class Unfolding(eqx.Module):
@@ -39,14 +40,15 @@ class Unfolding(eqx.Module):
     def axes(self) -> tuple[int, ...]:
         return tuple(axis for axis in range(3) if len(self.blocks[axis]) > 1)
 
-    def unfold(self, field: Float[Array, "C nx ny nz"]) -> Float[Array, "C X Y Z"]:
+    def unfold(self, field: Field) -> Field:
+        """A field [C, nx, ny, nz] and its images, [C, X, Y, Z], of numpy or of JAX."""
         xp = numpy_or_jax_of(field)
         for axis in self.axes:
             parts = [xp.flip(field, axis + 1) if mirrored else field for mirrored in self.blocks[axis]]
             field = xp.concatenate(parts, axis + 1)
         return field
 
-    def fold(self, field: Float[Array, "C X Y Z"]) -> Float[Array, "C nx ny nz"]:
+    def fold(self, field: Field) -> Field:
         """Sum over the images: the transpose of `unfold`."""
         xp = numpy_or_jax_of(field)
         for axis in self.axes:
@@ -108,11 +110,11 @@ class Layout(eqx.Module):
         order = AXES[axis]
         return self.padded[order[0]], self.padded[order[1]], self.padded[order[2]]
 
-    def to_padded(self, field: Float[Array, "C nx ny nz"]) -> Float[Array, "C X Y Z"]:
-        """Unfold a field of the scene's lattice and give it ghost voxels (0)."""
+    def to_padded(self, field: Field) -> Field:
+        """Unfold a field [C, nx, ny, nz] of the scene's lattice and give it ghost voxels (0)."""
         return numpy_or_jax_of(field).pad(self.unfolding.unfold(field), ((0, 0), *((p, p) for p in self.pad)))
 
-    def from_padded(self, field: Float[Array, "C X Y Z"]) -> Float[Array, "C nx ny nz"]:
+    def from_padded(self, field: Field) -> Field:
         inner = tuple(slice(p, n - p) for p, n in zip(self.pad, self.padded, strict=True))
         return self.unfolding.fold(field[(slice(None), *inner)])
 
@@ -161,8 +163,8 @@ def flat_planes(field: Float[Array, "*C X Y Z"], axis: int) -> Float[Array, "K *
 def picked(values: Array | np.ndarray, index: Int[Array, " M"]) -> Array:
     """values[..., index]; zeros where a scene has no elements to pick from, and rows of reads only pad."""
     if isinstance(values, np.ndarray):
-        index = np.asarray(index)
-        return as_jax(values[..., index] if values.shape[-1] else np.zeros((*values.shape[:-1], len(index)), values.dtype))
+        there = np.asarray(index)
+        return as_jax(values[..., there] if values.shape[-1] else np.zeros((*values.shape[:-1], len(there)), values.dtype))
     return values[..., index] if values.shape[-1] else jnp.zeros((*values.shape[:-1], len(index)), values.dtype)
 
 

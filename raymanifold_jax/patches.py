@@ -17,7 +17,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -25,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.spatial import KDTree
 
 from . import checks
-from .arrays import worked_out_now
+from .arrays import stop_gradient, worked_out_now
 from .directions import frames
 from .emitters import CLEARANCE, SMALL, EmittingFaces, emitting_faces, share_that_emits
 from .march import transmittance_unfolded
@@ -112,16 +111,12 @@ def light_of_emitters(
     patches = _patches(scene, faces, side)
     if not checks.is_traced(known):
         rows = _sample(surfaces)
-        exact, *_ = _arriving(_still(scene), patches, surfaces, rows, known[0])
+        exact, *_ = _arriving(stop_gradient(scene), patches, surfaces, rows, known[0])
         off = np.sqrt(np.mean((np.asarray(known[1])[:, rows] - np.asarray(exact)) ** 2, axis=1))
         if np.all(off <= _TOLERANCE * np.asarray(known[2])[:, rows].mean(1)):
             return None
     found, unattenuated, near = _arriving(scene, patches, surfaces, np.arange(len(surfaces)), radiance)
     return found * jnp.asarray(_conserving(scene, surfaces, faces, unattenuated, near), found.dtype)
-
-
-def _still(scene: Scene) -> Scene:
-    return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_inexact_array(a) else a, scene)
 
 
 def _sample(surfaces: Surfaces) -> np.ndarray:
@@ -226,7 +221,7 @@ def _arriving(
     scene: Scene, patches: _Patches, surfaces: Surfaces, rows: np.ndarray, radiance: Float[Array, "C owners"]
 ) -> tuple[Float[Array, "C n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """The mean irradiance of some elements; what it would be without a medium, of radiance 1; which are next to emitters."""
-    still, parts, unattenuated = _still(scene), [], []
+    still, parts, unattenuated = stop_gradient(scene), [], []
     receiver, position, weight = _receivers(scene, patches, surfaces, rows)
     normal = surfaces.normal[rows][receiver]
     for begin in range(0, len(receiver), _BLOCK):
@@ -255,7 +250,7 @@ def _receivers(scene: Scene, patches: _Patches, surfaces: Surfaces, rows: np.nda
     points = points + (surfaces.voxel[rows[near]] + 0.5)[:, None]
     if scene.solids and len(near):  # what another solid covers of a face is none of it
         outside = scene.lattice.lower + (points + 0.02 * normal[:, None]) * scene.lattice.spacing
-        weight = np.where(np.asarray(_still(scene).distance(jnp.asarray(outside))) > 0, weight, 0.0)
+        weight = np.where(np.asarray(stop_gradient(scene).distance(jnp.asarray(outside))) > 0, weight, 0.0)
     alone = ~weight.any(1)
     points[alone, 0], weight[alone, 0] = position[near[alone]], 1.0
     kept = weight > 0

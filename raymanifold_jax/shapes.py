@@ -38,7 +38,9 @@ Bounds = tuple[Float[np.ndarray, " 3"], Float[np.ndarray, " 3"]]
 _MANY = 1 << 14
 
 
-def dot(one: Float[jax.Array, "*batch n"], other: Float[jax.Array, "*batch n"]) -> Float[jax.Array, "*batch"]:
+def dot(
+    one: Float[jax.Array, "*batch n"], other: Float[jax.Array, "*batch n"] | Float[np.ndarray, "*batch n"]
+) -> Float[jax.Array, "*batch"]:
     """Scalar product along the last axis."""
     if one.size < _MANY:
         return jnp.sum(one * other, axis=-1)

@@ -22,11 +22,11 @@ from jax.sharding import Mesh
 from jaxtyping import Array, Bool, Float
 
 from . import checks
-from .arrays import as_jax, numpy_or_jax, real_dtype, worked_out_now
 from .acceleration import make_diffusion
+from .arrays import as_jax, numpy_or_jax, real_dtype, stop_gradient, worked_out_now
 from .checkpoint import Checkpoint
 from .direct import first_flight, sky_radiance
-from .implicit import Unwatched, attach, stop_gradient
+from .implicit import Unwatched, attach
 from .iteration import Iteration, System, certify
 from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
@@ -287,9 +287,7 @@ def _check_arguments(scene, quadrature, scheme, rtol, solver, max_sweeps, mesh, 
     checks.positive_int("max_sweeps", max_sweeps)
     finest = 16 * float(jnp.finfo(real_dtype()).eps)
     if not (isinstance(rtol, (int, float, np.floating)) and math.isfinite(rtol) and finest <= rtol < 1):
-        checks.fail(
-            "rtol", repr(rtol), f"a number from {finest:.2g} (what {real_dtype()} can hold) to 1", "use 1e-3 to 1e-5"
-        )
+        checks.fail("rtol", repr(rtol), f"a number from {finest:.2g} (what {real_dtype()} can hold) to 1", "use 1e-3 to 1e-5")
 
 
 def _check_steady(scene: Scene, surfaces: Surfaces, stuff: Materials) -> None:

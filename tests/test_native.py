@@ -141,7 +141,8 @@ def test_links(boundary, monkeypatch):
     for method in ("arriving", "sent"):
         right = getattr(expected, method)(case.elements)
         _close(getattr(found, method)(case.elements), right, case.free)
-        _close(jax.jit(lambda sent, method=method: getattr(found, method)(sent))(case.elements), right, case.free)  # the same list, followed by XLA
+        by_xla = jax.jit(lambda sent, method=method: getattr(found, method)(sent))  # along the same list
+        _close(by_xla(case.elements), right, case.free)
 
 
 @pytest.mark.parametrize("name", ["vacuum", "around an axis, mirrored", "around two axes"])

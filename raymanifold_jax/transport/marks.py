@@ -51,7 +51,7 @@ def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinat
 @eqx.filter_jit  # by axis: in a cubic lattice they share a program
 def _hit_bits(
     geometry: tuple[Array, ...],
-    strides: Int[Array, "3"],
+    strides: Int[np.ndarray, "3"],
     shape: tuple[int, int, int],
     padded: tuple[bool, ...],
     ordinates: Ordinates,

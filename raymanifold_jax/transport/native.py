@@ -201,7 +201,7 @@ def views(
 
     real, found = np.dtype(layout.plane.dtype), []
 
-    def along(line: _Axis, arguments: tuple, how: machine_code.Manner, axis: int) -> None:
+    def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
         planes, cut, hits, probes = arguments
         codes = numbers.transpose(AXES[axis]).reshape(-1).astype(np.int32)
         listed = _frozen(tuple(codes[_flat(cells, line.area)] for cells in (cut, line.ghosts)))
@@ -221,8 +221,8 @@ def views(
         for seen in on_cores(run, line.parts):
             found.extend(seen)
 
-    for axis, *of_axis in _lines(Manner(False), layout, ordinates, None, 1, False, real):
-        along(*of_axis, axis)
+    for line in _lines(Manner(False), layout, ordinates, None, 1, False, real):
+        along(*line)
     none = np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, real)
     element, source, weight = (np.concatenate(values) for values in zip(none, *found, strict=True))
     return element, source, weight
@@ -249,12 +249,12 @@ def follow(to: Array, of: Array, weight: Array, sent: Float[np.ndarray, "C n"], 
         code.follow(ends[number], ends[number + 1], *links, sent, got)
         return got
 
-    return sum(on_cores(run, range(count_cores())))
+    return np.sum(list(on_cores(run, range(count_cores()))), axis=0)
 
 
 def hit_bits(
     geometry: tuple[Array, ...],
-    strides: Int[Array, "3"],
+    strides: Int[np.ndarray, "3"],
     shape: tuple[int, int, int],
     padded: tuple[bool, bool, bool],
     ordinates: Ordinates,
@@ -310,8 +310,8 @@ def _work(code, line: _Axis, directions: int, real) -> machine_code.Work:
     return code.Work(
         rows=np.zeros((directions + 4, size + 2 * width), real), nowhere=np.zeros(size, real), asked=np.zeros((3, size), real),
         here=np.zeros((12, int(np.diff(line.cut.first).max())), real), own=np.zeros(directions, int), free=np.zeros(4, int),
-        point=np.zeros(3), whole=np.zeros(3), form=np.zeros((code.ROWS + 1) * code.BLOCK), picked=np.zeros(_most(line), np.int32),
-        at=np.zeros(code.BLOCK, np.int32), way=_segments(code),
+        point=np.zeros(3), whole=np.zeros(3), form=np.zeros((code.ROWS + 1) * code.BLOCK),
+        picked=np.zeros(_most(line), np.int32), at=np.zeros(code.BLOCK, np.int32), way=_segments(code),
     )  # fmt: skip
 
 

@@ -14,7 +14,22 @@ file here, touch `evolution.py`, `vacuum.py` and `marks.py`.
 Public: `forwards`, `backwards`, `in_vacuum`, `views`, `follow`, `mark`, `pack`, and the tuples that they take.
 """
 
-from .arguments import EVEN, PATCHY, UNEVEN, Around, Cells, Elements, Light, Manner, Planes, Readers, Segments, Standing, Ways, Work
+from .arguments import (
+    EVEN,
+    PATCHY,
+    UNEVEN,
+    Around,
+    Cells,
+    Elements,
+    Light,
+    Manner,
+    Planes,
+    Readers,
+    Segments,
+    Standing,
+    Ways,
+    Work,
+)
 from .evolution import backwards, forwards
 from .marks import mark, pack
 from .readers import BLOCK, ROWS

@@ -206,9 +206,7 @@ def _number_cut(cells, k, number, way, row, shift, sent):
 
 
 @compiled
-def _note_links(
-    paths, readers, picked, ways, n, count, way, numbers, sent, manner, form, links, element, source, weight
-):
+def _note_links(paths, readers, picked, ways, n, count, way, numbers, sent, manner, form, links, element, source, weight):
     """Add what elements of a plane see in one direction to the list of `links`, and return how long it is."""
     for first in range(0, len(picked), BLOCK):
         last = min(first + BLOCK, len(picked))
@@ -219,10 +217,11 @@ def _note_links(
             shares = form[(7 if number == 3 else number) * BLOCK :]
             for i in range(last - first):
                 m, share = picked[first + i], shares[i]
+                code = 0
                 if number < 3:
                     code = numbers[number, first + i]
-                else:
-                    code = sent[readers.cut[m]] if share != 0 else 0
+                elif share != 0:
+                    code = sent[readers.cut[m]]
                 # Written in any case: a processor cannot guess which count.
                 element[links], source[links], weight[links] = readers.element[m], code, share
                 links += 1 if (code > 0) & (share != 0) else 0
@@ -265,9 +264,7 @@ def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut,
                     if when >= 0:
                         there = of_cut, manner, form
                         known = ways, n, segments, way
-                        links = _note_links(
-                            False, hits, read_hits, *known, work.hits, *there, links, element, source, weight
-                        )
+                        links = _note_links(False, hits, read_hits, *known, work.hits, *there, links, element, source, weight)
                         links = _note_links(
                             True, probes, read_probes, *known, work.probes, *there, links, element, source, weight
                         )
