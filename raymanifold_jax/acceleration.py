@@ -163,7 +163,6 @@ def _where(probe: Int[Array, " E"], shape: tuple[int, ...]) -> tuple[Array, ...]
     return jnp.unravel_index(probe, shape[1:])
 
 
-@jax.jit  # twice in a program, where sources have slopes: traced once
 def _conjugate_gradients(levels: tuple[_Level, ...], right: Array) -> Array:
     dot = lambda a, b: jnp.sum(a * b, axis=(1, 2, 3), keepdims=True)
     ratio = lambda a, b: jnp.where(b > 0, a / jnp.where(b > 0, b, 1.0), 0.0)
