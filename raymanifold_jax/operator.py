@@ -292,9 +292,9 @@ def _outside(layout: Layout | Partition, voxels: Array) -> Array:
     return jnp.where(solid, 0.0, voxels)
 
 
-@eqx.filter_jit
-def _thickest(extinction: Array, spacing: float) -> Array:
-    return lax.stop_gradient(jnp.max(extinction)) * spacing
+@jax.jit
+def _greatest(extinction: Array) -> Array:
+    return lax.stop_gradient(jnp.max(extinction))
 
 
 def make_transport(
@@ -328,8 +328,10 @@ def _make_transport(
     with worked_out_now():
         ordinates = mark_over(layout, make_ordinates(quadrature, bands, plane_size(layout)))
     padded = None if extinction is None else layout.to_padded(extinction)
-    thickest = None if extinction is None else _thickest(extinction, layout.spacing)
-    thickest = thickest if thickest is None or checks.is_traced(thickest) else np.asarray(thickest)
+    thickest = None
+    if extinction is not None:
+        thickest = _greatest(extinction)
+        thickest = (thickest if checks.is_traced(thickest) else np.asarray(thickest)) * layout.spacing
     # Programs differ by these: where the extinction is not known yet, by the one that always serves.
     thin = thickest is not None and checks.surely(thickest * np.sqrt(3) <= thin_limit(thickest.dtype))
     thick = thickest is not None and not checks.surely(thickest <= THIN)

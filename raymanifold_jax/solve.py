@@ -378,11 +378,11 @@ def _fields(rest: Light, sun: Light, outside: Bool[Array, "nx ny nz"]) -> dict[s
 def _energy(scene: Scene, surfaces: Surfaces, quadrature, stuff: Materials, free, fields) -> Energy:
     points = [light.intensity for light in scene.lights if isinstance(light, PointLight)]
     entering, area = _entering(scene, surfaces, quadrature, free.dtype), as_jax(surfaces.area, free.dtype)
-    return _account(stuff, free, fields, points, entering, area, as_jax(surfaces.open), scene.lattice.spacing)
+    return _account(stuff, free, fields, points, entering, area, as_jax(surfaces.open), np.asarray(scene.lattice.spacing))
 
 
 @eqx.filter_jit
-def _account(stuff: Materials, free, fields, points, entering, area, is_open, spacing: float) -> Energy:
+def _account(stuff: Materials, free, fields, points, entering, area, is_open, spacing) -> Energy:
     real, bands = free.dtype, len(stuff.albedo)
     irradiance = fields["diffuse_irradiance"] + fields["sun_irradiance"]
     emitted = jnp.sum(jnp.pi * stuff.emission * area)
