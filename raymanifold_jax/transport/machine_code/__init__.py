@@ -4,7 +4,9 @@ The equations are those of `characteristic`, where they are explained; here is h
 directions through all planes, a few at a time so that their rays stay in its cache. In most voxels a segment is a loop over
 the whole plane, without a branch, that moves the rays on the way: the ray that is in voxel i now was in voxel i - move before.
 Voxels that a surface cuts, and ghost voxels at the rim, are few: they are listed, and overwrite what that loop left there.
-Segments of no length are left out; where the extinction is the same all over a plane, so are the exponentials.
+Segments of no length are left out; where the extinction is the same all over a plane, so are the exponentials. Without a medium
+rays keep their place in memory, and only the listed voxels are visited (`vacuum`). What elements read is worked out for many of
+them at once (`readers`).
 
 Numbers of whole planes are of the fields' own type; those of elements are worked out in 64 bits.
 
