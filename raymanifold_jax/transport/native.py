@@ -320,7 +320,7 @@ def _standing(code, line: _Axis, directions: int, real) -> machine_code.Standing
     return code.Standing(
         rows=np.zeros((directions, line.area), real), shift=np.zeros(directions, int), nowhere=np.zeros(1, real),
         hits=np.zeros((3, most), real), probes=np.zeros((3, most), real), picked=np.zeros((2, most), np.int32),
-        here=np.zeros((3, int(np.diff(line.cut.first).max())), real), form=np.zeros((code.ROWS + 1) * code.BLOCK),
+        here=np.zeros((7, int(np.diff(line.cut.first).max())), real), form=np.zeros((code.ROWS + 1) * code.BLOCK),
         at=np.zeros(code.BLOCK, np.int32), way=_segments(code),
     )  # fmt: skip
 

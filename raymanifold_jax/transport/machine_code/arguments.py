@@ -141,7 +141,7 @@ class Standing(NamedTuple):
     hits: Any  # [3, most of a plane] rays before each segment, as those read them that are `picked`
     probes: Any
     picked: Any  # [2, most of a plane] hits and probes that read in a direction
-    here: Any  # [3, most CUT voxels in a plane]
+    here: Any  # [7, most CUT voxels in a plane] as in `Work`, of which vacuum needs three rows
     form: Any  # [(ROWS + 1) * BLOCK]
     at: Any  # [BLOCK]
     way: Any  # Segments

@@ -12,6 +12,7 @@ from numba.extending import register_jitable
 from .evolution import most_laps
 from .paths import chords, compiled
 from .readers import BLOCK, ROWS, add_each, forms_of, pick_marked, take, tilt
+from .voxels import ghost_light, put_cut
 
 
 @register_jitable
@@ -93,31 +94,24 @@ def _through_cut(cells, k, number, way, row, shift, emitted, here, weight):
 
 @compiled
 def _from_ghosts(ghosts, k, c, n, ways, row, shift, light):
-    size = len(row)
-    begun, end = ghosts.first[k], ghosts.first[k + 1]
-    if light.radiance.shape[0] == 0:
-        for j in range(begun, end):
-            row[place(ghosts.cell[j], shift, size)] = light.ghost[c, j]
-        return
-    for j in range(begun, end):
-        emitted = light.ghost[c, j]
-        if ghosts.image[j] >= 0:
-            emitted += light.radiance[ghosts.image[j], ways.index[n], c] * light.factor[c, j]
-        row[place(ghosts.cell[j], shift, size)] = emitted
+    for j in range(ghosts.first[k], ghosts.first[k + 1]):
+        row[place(ghosts.cell[j], shift, len(row))] = ghost_light(ghosts, j, c, n, ways, light)
 
 
 @compiled
 def _take_cut(cells, k, sums, here):
+    """The sums of CUT voxels so far, where `put_cut` looks for them."""
     begun = cells.first[k]
     for j in range(cells.first[k + 1] - begun):
-        here[1, j], here[2, j] = 0.0, sums[cells.cell[begun + j]]
+        here[1, j], here[6, j] = 0.0, sums[cells.cell[begun + j]]
 
 
 @compiled
-def _put_cut(cells, k, sums, here):
-    begun = cells.first[k]
-    for j in range(cells.first[k + 1] - begun):
-        sums[cells.cell[begun + j]] = here[2, j] + here[1, j]
+def _begin_batch(work, count):
+    for b in range(count):
+        work.shift[b] = 0
+        for i in range(work.rows.shape[1]):
+            work.rows[b, i] = 0
 
 
 @compiled
@@ -155,10 +149,7 @@ def in_vacuum(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wo
         batch = chosen[first : first + most]
         laps = most_laps(ways, batch)
         for c in range(bands):
-            for b in range(len(batch)):
-                shift[b] = 0
-                for i in range(size):
-                    rows[b, i] = 0
+            _begin_batch(work, len(batch))
             emitted = light.cut[c]
             for when in range(-(laps - 1) * count, count):
                 reading = when >= 0
@@ -191,7 +182,7 @@ def in_vacuum(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wo
                             _read(False, hits, of_hits, ways, n, segments, way, work.hits, *there, at_hits[c])
                             _read(True, probes, of_probes, ways, n, segments, way, work.probes, *there, at_probes[c])
                     if summing:
-                        _put_cut(cut, k, sums, here)
+                        put_cut(cut, k, sums, here)
 
 
 @compiled
@@ -240,10 +231,7 @@ def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut,
     most, links = len(rows), 0
     for first in range(0, len(chosen), most):
         batch = chosen[first : first + most]
-        for b in range(len(batch)):
-            shift[b] = 0
-            for i in range(size):
-                rows[b, i] = 0
+        _begin_batch(work, len(batch))
         for when in range(-(most_laps(ways, batch) - 1) * count, count):
             for sense in (1, -1):
                 k = when % count if sense > 0 else count - 1 - when % count

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from numba.extending import register_jitable
+
 from .arguments import EVEN, PATCHY
 from .paths import attenuation, bend_of, compiled, exp, mean_of, middle_and_whole
 
@@ -186,15 +188,15 @@ def put_cut(cells, k, sums, here):
         sums[cells.cell[begun + j]] = here[6, j] + here[1, j]
 
 
+@register_jitable
+def ghost_light(ghosts, j, c, n, ways, light):
+    """What a ghost voxel sends in a direction: its surface's light, and what comes in through an open side."""
+    if light.radiance.shape[0] == 0 or ghosts.image[j] < 0:
+        return light.ghost[c, j]
+    return light.ghost[c, j] + light.radiance[ghosts.image[j], ways.index[n], c] * light.factor[c, j]
+
+
 @compiled
 def from_ghosts(ghosts, k, c, n, ways, after, margin, light):
-    begun, end = ghosts.first[k], ghosts.first[k + 1]
-    if light.radiance.shape[0] == 0:
-        for j in range(begun, end):
-            after[margin + ghosts.cell[j]] = light.ghost[c, j]
-        return
-    for j in range(begun, end):
-        emitted = light.ghost[c, j]
-        if ghosts.image[j] >= 0:
-            emitted += light.radiance[ghosts.image[j], ways.index[n], c] * light.factor[c, j]
-        after[margin + ghosts.cell[j]] = emitted
+    for j in range(ghosts.first[k], ghosts.first[k + 1]):
+        after[margin + ghosts.cell[j]] = ghost_light(ghosts, j, c, n, ways, light)
