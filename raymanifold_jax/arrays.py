@@ -3,7 +3,7 @@
 `jnp.asarray` makes a program for every shape that it copies or converts, which takes JAX some milliseconds each at the start
 of every process; here numpy converts. So does every other operation outside of `jit`: numpy does them where numbers are known.
 
-Public: `as_jax`, `real_dtype`, `numpy_or_jax`, `numpy_or_jax_of`, `worked_out_now`, `stop_gradient`.
+Public: `as_jax`, `real_dtype`, `numpy_or_jax`, `numpy_or_jax_of`, `worked_out_now`, `stop_gradient`, `on_accelerator`.
 """
 
 from __future__ import annotations
@@ -29,6 +29,11 @@ def as_jax(values: Any, dtype: Any = None) -> Array:
     if isinstance(values, jax.Array) or checks.is_traced(values):
         return jnp.asarray(values, dtype)
     return jax.device_put(np.asarray(values, None if dtype is None else jax.dtypes.canonicalize_dtype(dtype)))
+
+
+def on_accelerator() -> bool:
+    """Whether JAX works on something else than a CPU."""
+    return jax.default_backend() != "cpu"
 
 
 def real_dtype() -> np.dtype:

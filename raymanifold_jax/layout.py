@@ -20,13 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from .arrays import as_jax, numpy_or_jax_of, real_dtype
+from .arrays import as_jax, numpy_or_jax_of, on_accelerator, real_dtype
 from .quadrature import Quadrature
 from .scene import MIRROR, Scene
 from .surfaces import Surfaces
 
 AXES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # sweep axis, u, v
 _CHUNK = 1 << 17  # rays times bands in one step: a compromise between a CPU's caches and the cost of starting a step
+_WIDE_CHUNK = 1 << 24  # the same on a GPU, which should start few steps, within its memory
 _WORD = 32
 Field = TypeVar("Field", Array, np.ndarray)
 
@@ -73,6 +74,7 @@ class Reads(eqx.Module):
     image: Int[Array, " M"]  # of which of the layout's element images this is
     first_tile: Int[Array, " K1"]
     tile: int = eqx.field(static=True)
+    window: int = eqx.field(static=True, default=0)  # so many rows from its first tile on hold a plane's (0: not known)
 
 
 class AxisReads(NamedTuple):
@@ -99,6 +101,7 @@ class Layout(eqx.Module):
     buried: Bool[Array, "X Y Z"]  # voxels wholly inside solids
     inflow_image: Int[Array, "X Y Z"]  # which mirror image an open ghost voxel belongs to; -1: not open
     reads: tuple[AxisReads, ...]  # by sweep axis
+    wide: bool = eqx.field(static=True, default=False)  # for a GPU: all of a plane at once, without a choice on the way
 
     @property
     def cubic(self) -> bool:
@@ -217,7 +220,8 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
     probing = ~blocked[tuple(probe.T)]
     rows = {"element": element, "image": np.arange(len(flat)), "offset": offset, "normal": normal, "away": np.zeros_like(away)}
     probes = {key: value[probing] for key, value in (rows | {"away": away}).items()}
-    real = real_dtype()
+    real, wide = real_dtype(), on_accelerator()
+    read = lambda *which: _reads(padded, *which, real, wide)
     return Layout(
         unfolding=unfolding,
         shape=lattice.shape,
@@ -233,9 +237,9 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
         buried=as_jax(blocked & ~ghost),
         inflow_image=as_jax(inflow.reshape(padded), np.int32),
         reads=tuple(
-            AxisReads(hits, other)
-            for hits, other in zip(_reads(padded, rows, voxel, real), _reads(padded, probes, probe[probing], real), strict=True)
+            AxisReads(hits, other) for hits, other in zip(read(rows, voxel), read(probes, probe[probing]), strict=True)
         ),
+        wide=wide,
     )
 
 
@@ -280,20 +284,23 @@ def _voxel_planes(flat, offset, normal, area, total, padded, ghost) -> np.ndarra
     return plane
 
 
-def _reads(padded: tuple[int, int, int], rows: dict, voxel: np.ndarray, real) -> list[Reads]:
+def _reads(padded: tuple[int, int, int], rows: dict, voxel: np.ndarray, real, wide: bool) -> list[Reads]:
     """The reads of `voxel` by the elements in `rows`, for each sweep axis; all axes get arrays of the same length."""
     counts = [np.bincount(voxel[:, axis], minlength=padded[axis]) for axis in range(3)]
     occupied = np.concatenate(counts)
     typical = np.median(occupied[occupied > 0]) if len(voxel) else 1
     tile = int(np.clip(2 ** np.ceil(np.log2(max(typical, 1))), 64, 1024))
     total = max(1, *(int((-(-count // tile)).sum()) for count in counts)) * tile
-    return [_axis_reads(axes, padded[axes[2]], counts[axes[0]], tile, total, rows, voxel, real) for axes in AXES]
+    # Programs differ by the window: a power of 2, for few of them.
+    window = max(tile, 1 << int(max(c.max(initial=0) for c in counts) - 1).bit_length()) if wide else 0
+    sizes = tile, total + window, window
+    return [_axis_reads(axes, padded[axes[2]], counts[axes[0]], sizes, rows, voxel, real) for axes in AXES]
 
 
 def _axis_reads(
-    axes: tuple[int, int, int], width: int, count: np.ndarray, tile: int, total: int, rows: dict, voxel: np.ndarray, real
+    axes: tuple[int, int, int], width: int, count: np.ndarray, sizes: tuple[int, int, int], rows: dict, voxel: np.ndarray, real
 ) -> Reads:
-    axis, u, v = axes
+    (axis, u, v), (tile, total, window) = axes, sizes
     order = np.argsort(voxel[:, axis], kind="stable")
     first_tile = np.concatenate([[0], np.cumsum(-(-count // tile))])
     # Row of each read: its plane's first tile, then its rank in the plane.
@@ -315,6 +322,7 @@ def _axis_reads(
         image=spread(rows["image"], np.int32),
         first_tile=as_jax(first_tile, np.int32),
         tile=tile,
+        window=window,
     )
 
 
@@ -342,18 +350,23 @@ class Ordinates(eqx.Module):
         return dataclasses.replace(self, hit_bits=hits, probe_bits=probes)
 
 
-def make_ordinates(quadrature: Quadrature, bands: int, plane_size: int) -> tuple[Ordinates, ...]:
-    """Sort directions by their dominant axis and sense, and chunk them to suit planes of `plane_size` voxels."""
+def make_ordinates(quadrature: Quadrature, bands: int, plane_size: int, wide: bool = False) -> tuple[Ordinates, ...]:
+    """Sort directions by their dominant axis and sense, and chunk them to suit planes of `plane_size` voxels.
+
+    `wide`: large chunks, two of which are swept at once.
+    """
     w = quadrature.directions
     dominant = np.argmax(np.abs(w), axis=1)
     groups = {
         (axis, sign): np.nonzero((dominant == axis) & (np.sign(w[:, axis]) == sign))[0] for axis in range(3) for sign in (1, -1)
     }
     largest = max(len(g) for g in groups.values())
-    wanted = min(2 * _WORD, max(8, _CHUNK // (bands * plane_size)))
+    wanted = max(8, (_WIDE_CHUNK if wide else _CHUNK) // (bands * plane_size))
+    wanted = wanted if wide else min(2 * _WORD, wanted)
     size = -(-largest // -(-largest // wanted))
-    counts = [sum(-(-len(groups[axis, sign]) // size) for sign in (1, -1)) for axis in range(3)]
-    return tuple(_axis_ordinates(quadrature, axis, groups, size, max(counts)) for axis in range(3))
+    count = max(sum(-(-len(groups[axis, sign]) // size) for sign in (1, -1)) for axis in range(3))
+    count += count % 2 if wide else 0
+    return tuple(_axis_ordinates(quadrature, axis, groups, size, count) for axis in range(3))
 
 
 def _axis_ordinates(quadrature: Quadrature, axis: int, groups: dict, size: int, count: int) -> Ordinates:

@@ -326,7 +326,7 @@ def _make_transport(
     if not beam and layout.unfolding.axes:
         quadrature = quadrature.mirrored(layout.unfolding.axes)
     with worked_out_now():
-        ordinates = mark_over(layout, make_ordinates(quadrature, bands, plane_size(layout)))
+        ordinates = mark_over(layout, make_ordinates(quadrature, bands, plane_size(layout), layout.wide))
     padded = None if extinction is None else layout.to_padded(extinction)
     thickest = None
     if extinction is not None:

@@ -192,6 +192,11 @@ class _InBlocks(eqx.Module):
         return self.fields.plane
 
     @property
+    def wide(self) -> bool:
+        """Not so: rays also cross from block to block."""
+        return False
+
+    @property
     def buried(self) -> Bool[Array, "X Y Z"]:
         return self.fields.buried[0]
 

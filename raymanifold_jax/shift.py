@@ -27,16 +27,23 @@ class Ring(NamedTuple):
 
 
 def shift(
-    values: Float[Array, "D C P"], offsets: Int[Array, " D"], width: int, wrap_v: bool, ring: Ring | None = None
+    values: Float[Array, "D C P"],
+    offsets: Int[Array, " D"],
+    width: int,
+    wrap_v: bool,
+    ring: Ring | None = None,
+    wide: bool = False,
 ) -> Float[Array, "D C P"]:
     """Move the rays of each direction by a flat offset: 0, +-1 (along v) or +-`width` (along u).
 
     Planes are flat with `width` voxels along v. Both ends are joined, so u is periodic as it stands; ghost voxels at the rim
     make that harmless where the domain is not. `wrap_v` joins the ends of each row as well. With a `ring` planes are split
-    over the mesh, and both ends of both axes are joined.
+    over the mesh, and both ends of both axes are joined. `wide`: for a GPU.
     """
     if ring is not None:
         return _shift_around(values, offsets, ring)
+    if wide:
+        return _picked(values, offsets, width, wrap_v)
     moved = _roll(values, offsets, width)
     if not wrap_v or width == 1:
         return moved
@@ -46,6 +53,18 @@ def shift(
     back = _roll(values, offsets - width * along_v, width)
     crossed = ((along_v[:, None] > 0) & (column == 0)) | ((along_v[:, None] < 0) & (column == width - 1))
     return jnp.where(crossed[:, None, :], back, moved)
+
+
+def _picked(values: Float[Array, "D C P"], offsets: Int[Array, " D"], width: int, wrap_v: bool) -> Float[Array, "D C P"]:
+    """`shift` by index: no copies, and whoever reads the result may read through it."""
+    cell = jnp.arange(values.shape[-1])
+    source = cell - offsets[:, None]
+    if wrap_v and width > 1:
+        along_v = jnp.where(jnp.abs(offsets) == 1, offsets, 0)[:, None]
+        crossed = ((along_v > 0) & (cell % width == 0)) | ((along_v < 0) & (cell % width == width - 1))
+        source = jnp.where(crossed, source + width * along_v, source)
+    source = source % values.shape[-1]
+    return jnp.take_along_axis(values, source[:, None], axis=-1, mode="promise_in_bounds")
 
 
 def _roll(values: Float[Array, "D C P"], offsets: Int[Array, " D"], reach: int) -> Float[Array, "D C P"]:

@@ -139,6 +139,7 @@ class _Track(NamedTuple):
     wrap_v: bool
     spacing: float
     ring: Ring | None = None  # where planes are split over devices
+    wide: bool = False  # see `Layout`
 
     def length(self, own: Ordinates) -> Float[Array, " D"]:
         return self.spacing / jnp.abs(own.direction[:, 0])
@@ -154,6 +155,8 @@ class _Track(NamedTuple):
         plane = _row(self.fields, number)
         plane = plane if sent is None else plane.sending(sent)
         through = lambda cut: lambda: _cross(rays, chords, plane, length, entering, self, fluence, cut)
+        if self.wide:
+            return through(True)()
         return lax.cond(self.occupied[number], through(True), through(False))
 
     def uncross(self, number: Int[Array, ""], chords: Chords, length, entering, like: tuple, asked: tuple):
@@ -163,6 +166,8 @@ class _Track(NamedTuple):
         """
         plane = _row(self.fields, number)
         through = lambda cut: lambda: _uncross(chords, plane, length, entering, self, cut, like, asked)
+        if self.wide:
+            return through(True)()
         return lax.cond(self.occupied[number], through(True), through(False))
 
     def lap(self, own: Ordinates, first: Int[Array, ""] | int, rays: Float[Array, "D C P"], entering) -> Float[Array, "D C P"]:
@@ -206,7 +211,8 @@ def _track(layout: Layout | Block, axis: int, fields: _Fields, occupied: Array) 
     count, height, width = layout.padded_along(axis)
     periodic, wrap_v = layout.pad[axis] == 0, layout.pad[AXES[axis][2]] == 0
     rim, ring = layout.rim(axis), layout.ring(axis)
-    return _Track(fields, occupied, rim, count, height * width, width, periodic, wrap_v and ring is None, layout.spacing, ring)
+    wrap_v = wrap_v and ring is None
+    return _Track(fields, occupied, rim, count, height * width, width, periodic, wrap_v, layout.spacing, ring, layout.wide)
 
 
 def _sweep_axis(
@@ -220,8 +226,7 @@ def _sweep_axis(
 ) -> tuple[Float[Array, "C M"], Float[Array, "C M2"], Float[Array, "K C P"] | None]:
     bands, real = track.fields.exitance.shape[1], track.fields.exitance.dtype
 
-    def chunk_step(chunk, totals):
-        own = _chunk(ordinates, chunk)
+    def chunk_step(own: Ordinates, totals):
         radiance_in = None if inflow is None else inflow.radiance[:, own.index]
         table, length = track.table(own, 0), track.length(own)
 
@@ -237,9 +242,9 @@ def _sweep_axis(
             starts, rays, passing = track.cross(number, rays, chords, length, entering(number), fluence)
             if passing is not None:
                 row = lax.dynamic_index_in_dim(mean, number, 0, keepdims=False)
-                row = row + jnp.tensordot(own.weight, passing, 1)
+                row = row + _total(own.weight, passing, track.wide)
                 mean = lax.dynamic_update_index_in_dim(mean, row, number, 0)
-            here = (own, starts, chords, _row(track.fields, number), length)
+            here = (own, starts, chords, _row(track.fields, number), length, track.wide)
             assert own.hit_bits is not None and own.probe_bits is not None  # by mark_hits
             hits = _read(hits, number, reads.hits, own.hit_bits, *here, _mean_of_hits)
             probes = _read(probes, number, reads.probes, ~own.probe_bits, *here, _mean_of_paths)
@@ -256,7 +261,27 @@ def _sweep_axis(
         jnp.zeros((bands, reads.probes.cell.shape[0]), real),
         jnp.zeros((track.count, bands, track.area), real) if fluence else None,
     )
-    return lax.fori_loop(0, ordinates.chunks, chunk_step, totals)
+    return each_chunk(ordinates, chunk_step, totals, track.wide)
+
+
+def each_chunk(ordinates: Ordinates, add: Callable[[Ordinates, Any], Any], totals: Any, wide: bool) -> Any:
+    """`add(chunk, totals)` one chunk of directions after the other; `wide`: two at a time, each of them to nothing."""
+    if not wide or ordinates.weight.shape[0] < 2:
+        return lax.fori_loop(0, ordinates.chunks, lambda number, totals: add(_chunk(ordinates, number), totals), totals)
+    axes = jax.tree.map(lambda a: 0 if a.ndim else None, ordinates)
+    nothing = jax.tree.map(jnp.zeros_like, totals)
+
+    def two(number, totals):
+        own = jax.tree.map(lambda a: lax.dynamic_slice_in_dim(a, 2 * number, 2) if a.ndim else a, ordinates)
+        found = jax.vmap(lambda chunk: add(chunk, nothing), in_axes=(axes,))(own)
+        return jax.tree.map(lambda total, more: total + more.sum(0), totals, found)
+
+    return lax.fori_loop(0, (ordinates.chunks + 1) // 2, two, totals)
+
+
+def _total(weight: Float[Array, " D"], values: Float[Array, "D C P"], wide: bool) -> Float[Array, "C P"]:
+    """The sum over directions: as a product, which a CPU does faster, or one that can be part of what makes the values."""
+    return (weight[:, None, None] * values).sum(0) if wide else jnp.tensordot(weight, values, 1)
 
 
 def _chunk(ordinates: Ordinates, number: Int[Array, ""]) -> Ordinates:
@@ -456,8 +481,7 @@ def _cross(rays, chords: Chords, fields: _Fields, length, entering, track: _Trac
     plane = _facing(fields, chords) if cut else None
     for number in range(3):
         if number:
-            # The barrier keeps XLA from computing the segment again for each reader of the moved rays.
-            rays = shift(lax.optimization_barrier(rays), chords.offsets[number - 1], track.width, track.wrap_v, track.ring)
+            rays = _moved(rays, chords.offsets[number - 1], track)
         starts.append(rays)
         rays, passed = _segment(number, rays, chords, fields, plane, length, entering, track, fluence)
         passing = passed if passing is None or passed is None else passing + passed
@@ -481,9 +505,14 @@ def _uncross(chords: Chords, fields: _Fields, length, entering, track: _Track, c
         backs.append(back)
         rays = rays + to_starts[number]
         if number:
-            rays = shift(lax.optimization_barrier(rays), -chords.offsets[number - 1], track.width, track.wrap_v, track.ring)
+            rays = _moved(rays, -chords.offsets[number - 1], track)
     sent, light = jax.tree.map(lambda *parts: sum(parts), *backs)
-    return rays, jax.tree.map(lambda a: jnp.tensordot(jnp.ones(directions, a.dtype), a, 1), sent), light
+    return rays, jax.tree.map(lambda a: _total(jnp.ones(directions, a.dtype), a, track.wide), sent), light
+
+
+def _moved(rays, offsets, track: _Track):
+    # The barrier keeps XLA from computing the segment again for each reader of the moved rays.
+    return shift(lax.optimization_barrier(rays), offsets, track.width, track.wrap_v, track.ring, track.wide)
 
 
 def _segment(number: int, rays, chords: Chords, fields: _Fields, plane: _Plane | None, length, entering, track, fluence: bool):
@@ -512,20 +541,45 @@ def _entering(image: Int[Array, " P"], radiance: Float[Array, "images D C"]) -> 
     return total
 
 
-class _TileRead(NamedTuple):
-    """One tile of elements that read voxels of a plane: which voxels, and what they read as a function of the light there."""
+class _ReadRows(NamedTuple):
+    """`count` rows of reads from `first` on, of which the first `used` count, if that is not None."""
+
+    first: Int[Array, ""]
+    count: int
+    used: Int[Array, ""] | None
+
+    def of(self, a: Array) -> Array:
+        return lax.dynamic_slice_in_dim(a, self.first, self.count, axis=-1)
+
+    def put(self, into: Array, values: Array) -> Array:
+        return lax.dynamic_update_slice_in_dim(into, values, self.first, axis=-1)
+
+
+def each_rows(reads: Reads, plane: Int[Array, ""], wide: bool, one: Callable[[_ReadRows, Any], Any], state: Any) -> Any:
+    """`one(rows, state)` for the reads of a plane: tile after tile, or (`wide`) at once, without those of others."""
+    begin, end = reads.first_tile[plane], reads.first_tile[plane + 1]
+    if wide:
+        return one(_ReadRows(begin * reads.tile, reads.window, (end - begin) * reads.tile), state)
+    return lax.fori_loop(begin, end, lambda tile, state: one(_ReadRows(tile * reads.tile, reads.tile, None), state), state)
+
+
+class _Read(NamedTuple):
+    """Elements that read voxels of a plane: which voxels, and what they read as a function of the light there."""
 
     cell: Int[Array, " T"]
     of_each: Callable  # (rays before each of three segments [D, C, T], voxels) -> by direction [D, C, T]
     value: Callable  # (rays before each of three segments [D, C, T], (exitance, source) [C, T]) -> [C, T]
 
 
-def _read_tile(tile, reads: Reads, bits, own: Ordinates, chords: Chords, plane: _Fields, length, mean_of) -> _TileRead:
-    """Weight * cosine * radiance of the elements of a tile, in the directions of `bits`."""
-    cut = lambda a: lax.dynamic_slice_in_dim(a, tile * reads.tile, reads.tile, axis=-1)
-    cell, face = cut(reads.cell), tuple(cut(component) for component in (*reads.plane, reads.height))
+def _read_rows(
+    rows: _ReadRows, reads: Reads, bits, own: Ordinates, chords: Chords, plane: _Fields, length, wide: bool, mean_of
+) -> _Read:
+    """Weight * cosine * radiance of the elements of some rows, in the directions of `bits`."""
+    cell, face = rows.of(reads.cell), tuple(rows.of(component) for component in (*reads.plane, reads.height))
     word, bit = np.divmod(np.arange(own.weight.shape[0]), 32)
-    chosen = ((cut(bits)[word] >> bit[:, None].astype(np.uint32)) & 1).astype(length.dtype)
+    chosen = ((rows.of(bits)[word] >> bit[:, None].astype(np.uint32)) & 1).astype(length.dtype)
+    if rows.used is not None:
+        chosen = jnp.where(jnp.arange(rows.count) < rows.used, chosen, 0)
     weight = own.weight[:, None] * jnp.maximum(-_along(own.direction, face), 0.0) * chosen
     voxels = plane.cells(cell)
 
@@ -534,23 +588,24 @@ def _read_tile(tile, reads: Reads, bits, own: Ordinates, chords: Chords, plane: 
 
     def value(radiance, sent):
         # Gathered once, not anew for every use; and summed as a product with ones: XLA vectorises neither otherwise.
-        light = lax.optimization_barrier((radiance, voxels.sending(sent)))
-        return jnp.tensordot(jnp.ones_like(own.weight), of_each(*light), 1)
+        light = radiance, voxels.sending(sent)
+        light = light if wide else lax.optimization_barrier(light)
+        return _total(jnp.ones_like(own.weight), of_each(*light), wide)
 
-    return _TileRead(cell, of_each, value)
+    return _Read(cell, of_each, value)
 
 
-def _read(sums, plane_number, reads: Reads, bits, own: Ordinates, starts, chords: Chords, plane: _Fields, length, mean_of):
+def _read(
+    sums, plane_number, reads: Reads, bits, own: Ordinates, starts, chords: Chords, plane: _Fields, length, wide: bool, mean_of
+):
     """Add what the elements that read voxels of this plane get."""
 
-    def one(tile, sums):
-        read = _read_tile(tile, reads, bits, own, chords, plane, length, mean_of)
+    def one(rows: _ReadRows, sums):
+        read = _read_rows(rows, reads, bits, own, chords, plane, length, wide, mean_of)
         total = read.value(tuple(ray[:, :, read.cell] for ray in starts), plane.cells(read.cell).sent)
-        start = tile * reads.tile
-        total = total + lax.dynamic_slice_in_dim(sums, start, reads.tile, axis=-1)
-        return lax.dynamic_update_slice_in_dim(sums, total, start, axis=-1)
+        return rows.put(sums, rows.of(sums) + total)
 
-    return lax.fori_loop(reads.first_tile[plane_number], reads.first_tile[plane_number + 1], one, sums)
+    return each_rows(reads, plane_number, wide, one, sums)
 
 
 def _along(direction: Float[Array, "D 3"], face: tuple) -> Float[Array, "D T"]:

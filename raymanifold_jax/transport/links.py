@@ -35,10 +35,12 @@ from .characteristic import (
     _fields,
     _mean_of_hits,
     _mean_of_paths,
-    _read_tile,
+    _read_rows,
+    _ReadRows,
     _row,
     _Track,
     _track,
+    each_rows,
 )
 from .cores import each_on_a_core
 
@@ -113,9 +115,9 @@ def _arriving(links: Links, exitance: Float[Array, "C E"]) -> Float[Array, "C E"
 
 
 def worth_linking(layout: Layout, directions: int) -> bool:
-    """Whether there are elements, and their links fit."""
+    """Whether there are elements, and their links fit. A GPU has swept anew before links are found."""
     count = layout.cell.shape[0]
-    return 0 < count < _NUMBERS and LINKS * count * directions <= MOST_LINKS
+    return not layout.wide and 0 < count < _NUMBERS and LINKS * count * directions <= MOST_LINKS
 
 
 def find_links(layout: Layout, ordinates: tuple[Ordinates, ...]) -> Links:
@@ -199,19 +201,19 @@ def _views(track: _Track, ordinates: Ordinates, chunk: Int[Array, ""], reads: Ax
 def _view(seen, plane_number, reads: Reads, bits, own: Ordinates, starts, chords: Chords, plane: _Fields, length, mean_of):
     """Note what the elements that read voxels of this plane see."""
 
-    def one(tile, seen):
-        read = _read_tile(tile, reads, bits, own, chords, plane, length, mean_of)
+    def one(rows: _ReadRows, seen):
+        read = _read_rows(rows, reads, bits, own, chords, plane, length, False, mean_of)
         rays = lax.optimization_barrier(tuple(ray[:, 0, read.cell] for ray in starts))
         sources = [*rays, jnp.broadcast_to(plane.exitance[:, read.cell], rays[0].shape)]
         # What is read is linear in the four: their weights are what it is for one of them alone.
-        voxels, ones = plane.cells(read.cell), jnp.ones((1, reads.tile), length.dtype)
-        none = jnp.zeros((len(rays[0]), 1, reads.tile), length.dtype)
+        voxels, ones = plane.cells(read.cell), jnp.ones((1, rows.count), length.dtype)
+        none = jnp.zeros((len(rays[0]), 1, rows.count), length.dtype)
         alone = [(tuple(none + (i == k) for i in range(3)), voxels.sending((ones * (k == 3),))) for k in range(4)]
         weights = [read.of_each(*light)[:, 0] for light in alone]
-        write = lambda to, values: lax.dynamic_update_slice_in_dim(to, jnp.stack(values[: len(to)]), tile * reads.tile, axis=-1)
+        write = lambda to, values: rows.put(to, jnp.stack(values[: len(to)]))
         return write(seen[0], [s.astype(np.int32) for s in sources]), write(seen[1], weights)
 
-    return lax.fori_loop(reads.first_tile[plane_number], reads.first_tile[plane_number + 1], one, seen)
+    return each_rows(reads, plane_number, False, one, seen)
 
 
 def _all_views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: Int[np.ndarray, "X Y Z"]) -> Iterator[_View]:

@@ -33,16 +33,18 @@ from ..partition import Block
 from .characteristic import (
     Inflow,
     SweptMedium,
-    _chunk,
     _entering,
     _fields,
     _mean_of_hits,
     _mean_of_paths,
     _on_axis,
-    _read_tile,
+    _read_rows,
+    _ReadRows,
     _row,
     _Track,
     _track,
+    each_chunk,
+    each_rows,
 )
 
 
@@ -178,8 +180,7 @@ def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, w
         at = lambda p: lax.dynamic_index_in_dim(p, number, 0, keepdims=False)
         return [lax.dynamic_update_index_in_dim(p, at(p) + r, number, 0) for p, r in zip(planes, rows, strict=True)]
 
-    def chunk_step(chunk, totals):
-        own = _chunk(ordinates, chunk)
+    def chunk_step(own: Ordinates, totals):
         length = track.length(own)
         rays_shape = (own.weight.shape[0], bands, track.area)
         nothing = jnp.zeros(rays_shape, real)
@@ -266,20 +267,20 @@ def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, w
             means = ((_mean_of_hits, own.hit_bits), (_mean_of_paths, ~own.probe_bits))
             for (mean_of, bits), where, values in zip(means, reads, rows, strict=True):
 
-                def one(tile, asked, mean_of=mean_of, bits=bits, where=where, values=values):
-                    read = _read_tile(tile, where, bits, own, chords, plane, length, mean_of)
+                def one(rows: _ReadRows, asked, mean_of=mean_of, bits=bits, where=where, values=values):
+                    read = _read_rows(rows, where, bits, own, chords, plane, length, track.wide, mean_of)
                     if whole:
                         here = tuple(ray[:, :, read.cell] for ray in starts), tuple(row[:, read.cell] for row in at)
                     else:
-                        some = jnp.zeros((rays_shape[0], bands, where.tile), real)
-                        here = (some,) * 3, (jnp.zeros((bands, where.tile), real),) * kinds
+                        some = jnp.zeros((rays_shape[0], bands, rows.count), real)
+                        here = (some,) * 3, (jnp.zeros((bands, rows.count), real),) * kinds
                     back = jax.vjp(read.value, *here)[1]
-                    to_starts, to_sent = back(lax.dynamic_slice_in_dim(values, tile * where.tile, where.tile, axis=-1))
+                    to_starts, to_sent = back(rows.of(values))
                     starts_sum, sent_sum = asked
                     starts_sum = tuple(s.at[:, :, read.cell].add(t) for s, t in zip(starts_sum, to_starts, strict=True))
                     return starts_sum, tuple(s.at[:, read.cell].add(t) for s, t in zip(sent_sum, to_sent, strict=True))
 
-                asked = lax.fori_loop(where.first_tile[number], where.first_tile[number + 1], one, asked)
+                asked = each_rows(where, number, track.wide, one, asked)
             return asked
 
         rays, totals = backwards(0, at_start(own.laps - 1), nothing, totals, True)
@@ -294,4 +295,4 @@ def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, w
 
     planes = [jnp.zeros((track.count, bands, track.area), real)] * (kinds + has_factor)
     radiance = None if entry is None else jnp.zeros_like(entry.radiance)
-    return lax.fori_loop(0, ordinates.chunks, chunk_step, (planes, radiance))
+    return each_chunk(ordinates, chunk_step, (planes, radiance), track.wide)
