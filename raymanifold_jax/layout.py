@@ -24,11 +24,13 @@ from .arrays import as_jax, numpy_or_jax_of, on_accelerator, real_dtype
 from .quadrature import Quadrature
 from .scene import MIRROR, Scene
 from .surfaces import Surfaces
+from .windows import Windows, make_windows
 
 AXES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))  # sweep axis, u, v
 _CHUNK = 1 << 17  # rays times bands in one step: a compromise between a CPU's caches and the cost of starting a step
 _WIDE_CHUNK = 1 << 24  # the same on a GPU, which should start few steps, within its memory
 _WORD = 32
+_TILE = 64  # at least, to 1024
 Field = TypeVar("Field", Array, np.ndarray)
 
 
@@ -74,7 +76,6 @@ class Reads(eqx.Module):
     image: Int[Array, " M"]  # of which of the layout's element images this is
     first_tile: Int[Array, " K1"]
     tile: int = eqx.field(static=True)
-    window: int = eqx.field(static=True, default=0)  # so many rows from its first tile on hold a plane's (0: not known)
 
 
 class AxisReads(NamedTuple):
@@ -82,6 +83,11 @@ class AxisReads(NamedTuple):
 
     hits: Reads
     probes: Reads
+    windows: Windows | None = None  # on a GPU, on which sweeps are *wide*: all of a plane at once, without a choice on the way
+
+    @property
+    def kinds(self) -> tuple[Reads, Reads]:
+        return self.hits, self.probes
 
 
 class Layout(eqx.Module):
@@ -101,7 +107,10 @@ class Layout(eqx.Module):
     buried: Bool[Array, "X Y Z"]  # voxels wholly inside solids
     inflow_image: Int[Array, "X Y Z"]  # which mirror image an open ghost voxel belongs to; -1: not open
     reads: tuple[AxisReads, ...]  # by sweep axis
-    wide: bool = eqx.field(static=True, default=False)  # for a GPU: all of a plane at once, without a choice on the way
+
+    @property
+    def wide(self) -> bool:
+        return self.reads[0].windows is not None
 
     @property
     def cubic(self) -> bool:
@@ -220,8 +229,7 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
     probing = ~blocked[tuple(probe.T)]
     rows = {"element": element, "image": np.arange(len(flat)), "offset": offset, "normal": normal, "away": np.zeros_like(away)}
     probes = {key: value[probing] for key, value in (rows | {"away": away}).items()}
-    real, wide = real_dtype(), on_accelerator()
-    read = lambda *which: _reads(padded, *which, real, wide)
+    real = real_dtype()
     return Layout(
         unfolding=unfolding,
         shape=lattice.shape,
@@ -236,10 +244,7 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
         share=as_jax(area / np.maximum(total[flat], 1e-300), real),
         buried=as_jax(blocked & ~ghost),
         inflow_image=as_jax(inflow.reshape(padded), np.int32),
-        reads=tuple(
-            AxisReads(hits, other) for hits, other in zip(read(rows, voxel), read(probes, probe[probing]), strict=True)
-        ),
-        wide=wide,
+        reads=_all_reads(padded, [(rows, voxel), (probes, probe[probing])], real),
     )
 
 
@@ -284,23 +289,35 @@ def _voxel_planes(flat, offset, normal, area, total, padded, ghost) -> np.ndarra
     return plane
 
 
-def _reads(padded: tuple[int, int, int], rows: dict, voxel: np.ndarray, real, wide: bool) -> list[Reads]:
-    """The reads of `voxel` by the elements in `rows`, for each sweep axis; all axes get arrays of the same length."""
-    counts = [np.bincount(voxel[:, axis], minlength=padded[axis]) for axis in range(3)]
+def _all_reads(padded: tuple[int, int, int], kinds: list[tuple[dict, np.ndarray]], real) -> tuple[AxisReads, ...]:
+    """The reads of each kind, by the elements in its rows, of their voxels."""
+    counts = [[np.bincount(voxel[:, axis], minlength=padded[axis]) for axis in range(3)] for _, voxel in kinds]
+    if not on_accelerator():
+        tiles, spare, windows = [_usual_tile(of_kind) for of_kind in counts], 0, (None,) * 3
+    else:
+        rows = [np.maximum(*(-(-of_kind[axis] // _TILE) * _TILE for of_kind in counts)) for axis in range(3)]
+        windows = make_windows(rows, [int(np.prod(padded)) // n for n in padded])
+        tiles, spare = [_TILE] * len(kinds), windows[0].size + windows[0].rest
+    of_kinds = [_reads(padded, *kind, c, tile, spare, real) for kind, c, tile in zip(kinds, counts, tiles, strict=True)]
+    return tuple(AxisReads(hits, probes, w) for hits, probes, w in zip(*of_kinds, windows, strict=True))
+
+
+def _usual_tile(counts: list[np.ndarray]) -> int:
     occupied = np.concatenate(counts)
-    typical = np.median(occupied[occupied > 0]) if len(voxel) else 1
-    tile = int(np.clip(2 ** np.ceil(np.log2(max(typical, 1))), 64, 1024))
-    total = max(1, *(int((-(-count // tile)).sum()) for count in counts)) * tile
-    # Programs differ by the window: a power of 2, for few of them.
-    window = max(tile, 1 << int(max(c.max(initial=0) for c in counts) - 1).bit_length()) if wide else 0
-    sizes = tile, total + window, window
-    return [_axis_reads(axes, padded[axes[2]], counts[axes[0]], sizes, rows, voxel, real) for axes in AXES]
+    typical = np.median(occupied[occupied > 0]) if occupied.any() else 1
+    return int(np.clip(2 ** np.ceil(np.log2(max(typical, 1))), _TILE, 1024))
+
+
+def _reads(padded: tuple[int, int, int], rows: dict, voxel: np.ndarray, counts, tile: int, spare: int, real) -> list[Reads]:
+    """The reads of `voxel` by the elements in `rows`, for each sweep axis; all axes get arrays of the same length."""
+    total = max(1, *(int((-(-count // tile)).sum()) for count in counts)) * tile + spare
+    return [_axis_reads(axes, padded[axes[2]], counts[axes[0]], tile, total, rows, voxel, real) for axes in AXES]
 
 
 def _axis_reads(
-    axes: tuple[int, int, int], width: int, count: np.ndarray, sizes: tuple[int, int, int], rows: dict, voxel: np.ndarray, real
+    axes: tuple[int, int, int], width: int, count: np.ndarray, tile: int, total: int, rows: dict, voxel: np.ndarray, real
 ) -> Reads:
-    (axis, u, v), (tile, total, window) = axes, sizes
+    axis, u, v = axes
     order = np.argsort(voxel[:, axis], kind="stable")
     first_tile = np.concatenate([[0], np.cumsum(-(-count // tile))])
     # Row of each read: its plane's first tile, then its rank in the plane.
@@ -322,7 +339,6 @@ def _axis_reads(
         image=spread(rows["image"], np.int32),
         first_tile=as_jax(first_tile, np.int32),
         tile=tile,
-        window=window,
     )
 
 

@@ -34,11 +34,12 @@ from .quadrature import Quadrature
 from .scene import Scene, Wall
 from .surfaces import Surfaces, patch_points
 from .texture import Texture, mean_values
-from .transport.characteristic import Inflow, thin_limit
+from .transport.characteristic import Inflow
 from .transport.derivative import Manner, swept, unswept
 from .transport.links import Links, find_links, worth_linking
 from .transport.sharded import laps_over, mark_over, plane_size, slopes_over
 from .transport.slopes import THIN
+from .transport.step import thin_limit
 
 _MOST_LAPS = 1 << 16
 #: Rounds of Sinkhorn's iteration, over-relaxed; each costs about three sweeps. In vacuum one leaves 0 to .28 of what was off;

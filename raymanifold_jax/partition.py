@@ -369,10 +369,10 @@ class _Cut:
 
 def _cut_rows(shapes: Shapes, layout: Layout) -> list[list[_Cut]]:
     """For each sweep axis and kind of read: which rows each device reads, where, and the first tile of each plane."""
-    counts = [[_by_device(shapes, layout, axis, reads) for reads in layout.reads[axis]] for axis in range(3)]
+    counts = [[_by_device(shapes, layout, axis, reads) for reads in layout.reads[axis].kinds] for axis in range(3)]
     cuts: list[list[_Cut]] = [[], [], []]
     for kind in range(2):
-        tile = layout.reads[0][kind].tile
+        tile = layout.reads[0].kinds[kind].tile
         tiles = [-(-counts[axis][kind][2] // tile) for axis in range(3)]  # by device and plane
         total = max(1, *(int(t.sum(1).max(initial=0)) for t in tiles)) * tile
         for axis in range(3):
@@ -463,7 +463,8 @@ def _place_tables(shapes: Shapes, layout: Layout, place: Callable) -> _Tables:
 
     reads = []
     for of_axis, cuts in zip(layout.reads, _cut_rows(shapes, layout), strict=True):
-        reads.append(AxisReads(*(_place_reads(r, cut, place) for r, cut in zip(of_axis, cuts, strict=True))))
+        hits, probes = (_place_reads(r, cut, place) for r, cut in zip(of_axis.kinds, cuts, strict=True))
+        reads.append(AxisReads(hits, probes))
     return _Tables(
         spread(cell.astype(np.int32)), spread(layout.source_element), spread(layout.share), (reads[0], reads[1], reads[2])
     )

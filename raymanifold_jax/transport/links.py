@@ -28,21 +28,10 @@ from ..arrays import as_jax
 from ..layout import AxisReads, Layout, Ordinates, Reads
 from ..memory import LINKS, MOST_LINKS
 from . import native
-from .characteristic import (
-    Chords,
-    _chunk,
-    _Fields,
-    _fields,
-    _mean_of_hits,
-    _mean_of_paths,
-    _read_rows,
-    _ReadRows,
-    _row,
-    _Track,
-    _track,
-    each_rows,
-)
+from .characteristic import fields_along, track_along
 from .cores import each_on_a_core
+from .reading import Rows, each_rows, mean_of_hits, mean_of_paths, read_rows
+from .step import Chords, Fields, Track, chunk_of, row_of
 
 _NUMBERS = 1 << 24  # that 32-bit reals hold
 
@@ -149,7 +138,7 @@ def _swept_rows(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: Int[n
     for (axis, kind), parts in found.items():
         row, source, weight = (np.concatenate(values) for values in zip(*parts, strict=True))
         if len(row):
-            rows.append(_packed(row, source, weight, layout.reads[axis][kind].element))
+            rows.append(_packed(row, source, weight, layout.reads[axis].kinds[kind].element))
     return rows
 
 
@@ -167,24 +156,24 @@ def _packed(row: np.ndarray, source: np.ndarray, weight: np.ndarray, element: Ar
 
 
 @eqx.filter_jit  # by axis: in a cubic lattice they share a program
-def _views(track: _Track, ordinates: Ordinates, chunk: Int[Array, ""], reads: AxisReads) -> tuple[tuple[Array, Array], ...]:
+def _views(track: Track, ordinates: Ordinates, chunk: Int[Array, ""], reads: AxisReads) -> tuple[tuple[Array, Array], ...]:
     """What the hits and the probes of one chunk see: numbers of voxels that send, 0 for none, and their weights.
 
     Hits [3 D, M] see by the rays before each of the three segments in a voxel, probes [4 D, M] the voxel's own surface as well.
     """
-    own = _chunk(ordinates, chunk)
+    own = chunk_of(ordinates, chunk)
     table, length = track.table(own, 0), track.length(own)
     dark = lambda _: None
 
     def plane_step(step, carry):
         rays, seen = carry
-        number, chords = track.plane(own, step), _row(table, step)
+        number, chords = track.plane(own, step), row_of(table, step)
         starts, rays, _ = track.cross(number, rays, chords, length, None, False)
-        plane = _row(track.fields, number)
+        plane = row_of(track.fields, number)
         assert own.hit_bits is not None and own.probe_bits is not None  # by mark_hits
         here = (own, starts, chords, plane, length)
-        hits = _view(seen[0], number, reads.hits, own.hit_bits, *here, _mean_of_hits)
-        return rays, (hits, _view(seen[1], number, reads.probes, ~own.probe_bits, *here, _mean_of_paths))
+        hits = _view(seen[0], number, reads.hits, own.hit_bits, *here, mean_of_hits)
+        return rays, (hits, _view(seen[1], number, reads.probes, ~own.probe_bits, *here, mean_of_paths))
 
     def nothing(kind: Reads, kinds: int):
         shape = (kinds, own.weight.shape[0], kind.cell.shape[0])
@@ -198,11 +187,11 @@ def _views(track: _Track, ordinates: Ordinates, chunk: Int[Array, ""], reads: Ax
     return jax.tree.map(lambda a: a.reshape(-1, a.shape[-1]), seen)
 
 
-def _view(seen, plane_number, reads: Reads, bits, own: Ordinates, starts, chords: Chords, plane: _Fields, length, mean_of):
+def _view(seen, plane_number, reads: Reads, bits, own: Ordinates, starts, chords: Chords, plane: Fields, length, mean_of):
     """Note what the elements that read voxels of this plane see."""
 
-    def one(rows: _ReadRows, seen):
-        read = _read_rows(rows, reads, bits, own, chords, plane, length, False, mean_of)
+    def one(rows: Rows, seen):
+        read = read_rows(rows, reads, bits, own, chords, plane, length, mean_of)
         rays = lax.optimization_barrier(tuple(ray[:, 0, read.cell] for ray in starts))
         sources = [*rays, jnp.broadcast_to(plane.exitance[:, read.cell], rays[0].shape)]
         # What is read is linear in the four: their weights are what it is for one of them alone.
@@ -213,7 +202,7 @@ def _view(seen, plane_number, reads: Reads, bits, own: Ordinates, starts, chords
         write = lambda to, values: rows.put(to, jnp.stack(values[: len(to)]))
         return write(seen[0], [s.astype(np.int32) for s in sources]), write(seen[1], weights)
 
-    return each_rows(reads, plane_number, False, one, seen)
+    return each_rows(reads, plane_number, None, one, seen)
 
 
 def _all_views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: Int[np.ndarray, "X Y Z"]) -> Iterator[_View]:
@@ -222,8 +211,8 @@ def _all_views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: Int[np
     for axis, (own, reads) in enumerate(zip(ordinates, layout.reads, strict=True)):
         if own.weight.shape[0] == 0:
             continue
-        fields, occupied, _ = _fields(layout, axis, codes, None, False)
-        track = _track(layout, axis, fields, occupied)
+        fields, occupied, _ = fields_along(layout, axis, codes, None, False)
+        track = track_along(layout, axis, fields, occupied)
 
         def of_chunk(chunk: int, track=track, own=own, reads=reads, axis=axis) -> list[_View]:
             return [_seen(axis, *of_kind) for of_kind in enumerate(_views(track, own, jnp.int32(chunk), reads))]

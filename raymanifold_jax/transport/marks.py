@@ -16,7 +16,8 @@ from jaxtyping import Array, Float, Int, UInt32
 
 from ..layout import AXES, Layout, Ordinates, picked
 from . import native
-from .characteristic import _chords, _chunk, _hit
+from .reading import arrival
+from .step import chords_at, chunk_of
 
 
 def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinates, ...]:
@@ -44,7 +45,7 @@ def mark_hits(layout: Layout, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinat
             bits = np.zeros((own.weight.shape[0], -(-own.weight.shape[1] // 32), face.shape[1]), np.uint32)
         else:
             bits = hit_bits(geometry, np.array([strides[a] for a in order]), shape, padded, own, face, home)
-        found.append(own.marked(*(picked(bits, r.image) for r in reads)))
+        found.append(own.marked(*(picked(bits, r.image) for r in reads.kinds)))
     return tuple(found)
 
 
@@ -69,10 +70,10 @@ def _hit_bits(
     def one(chunk: Ordinates, face, home):
         plane, row, column = home
         face = tuple(component[None] for component in face)
-        chords = _chords(chunk, jnp.where(chunk.sign > 0, plane, count - 1 - plane), width, not padded[2])
+        chords = chords_at(chunk, jnp.where(chunk.sign > 0, plane, count - 1 - plane), width, not padded[2])
         found, clean = False, True
         for number, ends in enumerate(chords.ends):
-            hit = _hit(face, ends, chords.share[number][:, None, None])[0][:, 0, 0]
+            hit = arrival(face, ends, chords.share[number][:, None, None])[0][:, 0, 0]
             offset = jnp.zeros_like(chords.offsets[0]) if number == 0 else chords.offsets[number - 1]
             along_v = jnp.where((jnp.abs(offset) == 1) & (width > 1), offset, 0)
             along_u = (offset - along_v) // width
@@ -93,6 +94,6 @@ def _hit_bits(
         return jnp.sum(flags << jnp.arange(32, dtype=jnp.uint32), axis=1, dtype=jnp.uint32)
 
     def of_chunk(number):
-        return jax.vmap(partial(one, _chunk(ordinates, number)), in_axes=(1, 1), out_axes=1)(face, home)
+        return jax.vmap(partial(one, chunk_of(ordinates, number)), in_axes=(1, 1), out_axes=1)(face, home)
 
     return lax.map(of_chunk, jnp.arange(ordinates.weight.shape[0]))

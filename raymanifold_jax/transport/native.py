@@ -27,8 +27,9 @@ from .. import checks
 from ..arrays import as_jax
 from ..keep import keep
 from ..layout import AXES, Layout, Ordinates, Reads
-from .characteristic import Inflow, thin_limit
+from .characteristic import Inflow
 from .cores import count_cores, on_cores, on_cpu
+from .step import thin_limit
 
 if TYPE_CHECKING:
     from . import machine_code
@@ -420,7 +421,7 @@ def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
     marked = lambda bits, wanted: (ways, chunk, place, np.asarray(bits), wanted)
     hits, probes = (
         _readers(code, reads, marked(bits, wanted), number, surface, cut)
-        for reads, bits, wanted in zip(layout.reads[axis], (own.hit_bits, own.probe_bits), (1, 0), strict=True)
+        for reads, bits, wanted in zip(layout.reads[axis].kinds, (own.hit_bits, own.probe_bits), (1, 0), strict=True)
     )
     # A core takes directions from all over, sorted by sense: the two senses meet planes in opposite order.
     numbers = np.argsort(-ways.sense, kind="stable")

@@ -33,19 +33,14 @@ from ..partition import Block
 from .characteristic import (
     Inflow,
     SweptMedium,
-    _entering,
-    _fields,
-    _mean_of_hits,
-    _mean_of_paths,
-    _on_axis,
-    _read_rows,
-    _ReadRows,
-    _row,
-    _Track,
-    _track,
     each_chunk,
-    each_rows,
+    fields_along,
+    on_axis,
+    radiance_entering,
+    track_along,
 )
+from .reading import Crowd, Rows, each_rows, mean_of_hits, mean_of_paths, read_rows
+from .step import Track, row_of
 
 
 class Adjoint(NamedTuple):
@@ -103,13 +98,13 @@ def adjoint_sweep(
     factor = None if inflow is None or inflow.factor is None else layout.exitance_field(inflow.factor)
 
     def one_axis(axis, own: Ordinates, reads: AxisReads, sums):
-        fields, occupied, images = _on_axis(axis, lambda a: _fields(layout, a, sent, medium, inflow is not None))
-        track = _track(layout, axis if isinstance(axis, int) else 0, fields, occupied)
-        planes = lambda field: None if field is None else _on_axis(axis, lambda a: layout.planes(field, a))
-        rows = tuple(picked(at_elements, r.element) for r in reads)
+        fields, occupied, images = on_axis(axis, lambda a: fields_along(layout, a, sent, medium, inflow is not None))
+        track = track_along(layout, axis if isinstance(axis, int) else 0, fields, occupied)
+        planes = lambda field: None if field is None else on_axis(axis, lambda a: layout.planes(field, a))
+        rows = tuple(picked(at_elements, r.element) for r in reads.kinds)
         entry = None if inflow is None else _Entry(images, inflow.radiance, planes(factor))
         back, light = _axis_adjoint(track, own, reads, rows, planes(asked), entry, whole)
-        back = _on_axis(axis, lambda a: [layout.from_planes(field, a) for field in _in_scene_order(back, a, sloped)])
+        back = on_axis(axis, lambda a: [layout.from_planes(field, a) for field in _in_scene_order(back, a, sloped)])
         fields, total = sums
         return [t + f for t, f in zip(fields, back, strict=True)], None if light is None else total + light
 
@@ -118,7 +113,7 @@ def adjoint_sweep(
     if layout.cubic:
         directions = jax.tree.map(lambda *a: jnp.stack(a), *ordinates)
         reads = jax.tree.map(lambda *a: jnp.stack(a), *layout.reads)
-        sums = lax.fori_loop(0, 3, lambda a, sums: one_axis(a, _row(directions, a), _row(reads, a), sums), sums)
+        sums = lax.fori_loop(0, 3, lambda a, sums: one_axis(a, row_of(directions, a), row_of(reads, a), sums), sums)
     else:
         for axis in range(3):
             sums = one_axis(axis, ordinates[axis], layout.reads[axis], sums)
@@ -156,7 +151,7 @@ class _Entry(NamedTuple):
     strength: Array | None
 
 
-def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, wanted, entry: _Entry | None, whole: bool):
+def _axis_adjoint(track: Track, ordinates: Ordinates, reads: AxisReads, rows, wanted, entry: _Entry | None, whole: bool):
     """Derivatives in planes [K, C, P] and in the radiance, of all chunks of one axis.
 
     The planes are of exitance, source, slopes, extinction and factor.
@@ -165,6 +160,7 @@ def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, w
     bands, real = fields.exitance.shape[1], fields.exitance.dtype
     fluence = wanted is not None
     zero_row = jnp.zeros((bands, track.area), real)
+    crowd = Crowd(reads.windows)
     has_medium = fields.extinction is not None
     kinds = len(fields.sent) + (has_medium and whole)
     has_factor = whole and entry is not None and entry.strength is not None
@@ -174,7 +170,7 @@ def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, w
         if not whole:
             return (zero_row,) * kinds
         full = fields.sent if fields.extinction is None else (*fields.sent, fields.extinction)
-        return tuple(_row(f, number) for f in full)
+        return tuple(row_of(f, number) for f in full)
 
     def add(planes, number, rows):
         at = lambda p: lax.dynamic_index_in_dim(p, number, 0, keepdims=False)
@@ -184,19 +180,20 @@ def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, w
         length = track.length(own)
         rays_shape = (own.weight.shape[0], bands, track.area)
         nothing = jnp.zeros(rays_shape, real)
+        none_asked = (nothing,) * 3, (zero_row,) * kinds
 
         def entering(number, light):
             if entry is None or light is None:
                 return None
-            radiance = _entering(_row(entry.image, number), light[0])
-            strength = light[1] if has_factor else None if entry.strength is None else _row(entry.strength, number)
+            radiance = radiance_entering(row_of(entry.image, number), light[0])
+            strength = light[1] if has_factor else None if entry.strength is None else row_of(entry.strength, number)
             return radiance if strength is None else radiance * strength
 
         def light_at(number):
             if entry is None:
                 return None
             radiance = entry.radiance[:, own.index] if whole else jnp.zeros_like(entry.radiance[:, own.index])
-            return (radiance, _row(entry.strength, number)) if has_factor else (radiance,)
+            return (radiance, row_of(entry.strength, number)) if has_factor else (radiance,)
 
         def through(number, chords, with_passing, rays):
             """The step through a plane, and its pullback to rays, what is sent, and what enters."""
@@ -227,7 +224,7 @@ def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, w
                 number = track.plane(own, k)
                 entries = lax.dynamic_update_index_in_dim(entries, rays, k, 0)
                 light = entering(number, light_at(number))
-                return track.cross(number, rays, _row(table, k), length, light, False)[1], entries
+                return track.cross(number, rays, row_of(table, k), length, light, False)[1], entries
 
             return lax.fori_loop(0, track.count, step, (rays, jnp.zeros((track.count, *rays_shape), real)))[1]
 
@@ -244,16 +241,25 @@ def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, w
             table = track.table(own, first)
             entries = forwards(first, start) if whole else None
 
+            def ask_rest(number, of_rest):
+                step = track.plane(own, number)  # the plane's number and the step's turn into each other
+                chords = row_of(table, step)
+                entered = nothing if entries is None else row_of(entries, step)
+                starts, _ = through(number, chords, False, entered)
+                return crowd.keep(of_rest, number, asked_at(number, chords, starts, none_asked, rest=True))
+
+            of_rest = crowd.each(ask_rest, crowd.nothing(none_asked)) if read else None
+
             def plane_step(k, carry):
                 rays, totals = carry
                 step = track.count - 1 - k
-                number, chords = track.plane(own, step), _row(table, step)
-                entered = nothing if entries is None else _row(entries, step)
+                number, chords = track.plane(own, step), row_of(table, step)
+                entered = nothing if entries is None else row_of(entries, step)
                 starts, back = through(number, chords, read and fluence, entered)
-                asked = ((nothing,) * 3, (zero_row,) * kinds)
+                asked = crowd.kept(of_rest, number, none_asked)
                 if read:
                     asked = asked_at(number, chords, starts, asked)
-                passing = own.weight[:, None, None] * _row(wanted, number)[None] if read and fluence else None
+                passing = own.weight[:, None, None] * row_of(wanted, number)[None] if read and fluence else None
                 to_starts, sent = asked
                 rays, more, light = back((to_starts, rays, passing))
                 sent = tuple(a + b for a, b in zip(sent, more, strict=True))
@@ -261,14 +267,14 @@ def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, w
 
             return lax.fori_loop(0, track.count, plane_step, (rays, totals))
 
-        def asked_at(number, chords, starts, asked):
-            plane, at = _row(fields, number), sent_row(number)
+        def asked_at(number, chords, starts, asked, rest=False):
+            plane, at = row_of(fields, number), sent_row(number)
             assert own.hit_bits is not None and own.probe_bits is not None
-            means = ((_mean_of_hits, own.hit_bits), (_mean_of_paths, ~own.probe_bits))
-            for (mean_of, bits), where, values in zip(means, reads, rows, strict=True):
+            means = ((mean_of_hits, own.hit_bits), (mean_of_paths, ~own.probe_bits))
+            for (mean_of, bits), where, values in zip(means, reads.kinds, rows, strict=True):
 
-                def one(rows: _ReadRows, asked, mean_of=mean_of, bits=bits, where=where, values=values):
-                    read = _read_rows(rows, where, bits, own, chords, plane, length, track.wide, mean_of)
+                def one(rows: Rows, asked, mean_of=mean_of, bits=bits, where=where, values=values):
+                    read = read_rows(rows, where, bits, own, chords, plane, length, mean_of)
                     if whole:
                         here = tuple(ray[:, :, read.cell] for ray in starts), tuple(row[:, read.cell] for row in at)
                     else:
@@ -280,7 +286,7 @@ def _axis_adjoint(track: _Track, ordinates: Ordinates, reads: AxisReads, rows, w
                     starts_sum = tuple(s.at[:, :, read.cell].add(t) for s, t in zip(starts_sum, to_starts, strict=True))
                     return starts_sum, tuple(s.at[:, read.cell].add(t) for s, t in zip(sent_sum, to_sent, strict=True))
 
-                asked = each_rows(where, number, track.wide, one, asked)
+                asked = each_rows(where, number, reads.windows, one, asked, rest)
             return asked
 
         rays, totals = backwards(0, at_start(own.laps - 1), nothing, totals, True)

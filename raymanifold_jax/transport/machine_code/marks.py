@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numba.extending import register_jitable
 
-from ..characteristic import _BEHIND
+from ..reading import BEHIND
 from .paths import chords, compiled
 from .readers import height_of, tilt
 
@@ -52,7 +52,7 @@ def mark(chosen, ways, around, elements, chunk, place, way, bits):
                 found, clean = False, True
                 for number in range(segments):
                     g0, g1 = height_of(elements.face, i, way.begin, number), height_of(elements.face, i, way.end, number)
-                    if g0 >= -_BEHIND and g1 < 0 and way.share[number] > 0 and g0 > g1:
+                    if g0 >= -BEHIND and g1 < 0 and way.share[number] > 0 and g0 > g1:
                         found, clean = True, clean and _clean(around, elements, i, k, number, sense, way)
                 if found and clean:
                     bits[g, word, i] |= bit

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numba.extending import register_jitable
 
-from ..characteristic import _BEHIND, _ONWARD
+from ..reading import BEHIND, ONWARD
 from ..slopes import THIN
 from .paths import bend_of, compiled, exp, mean_of
 
@@ -111,7 +111,7 @@ def _hits_in_vacuum(form, size, to, b, e):
         j = np.uintp(i)
         g0 = form[j + _F0] + form[j + _F1] * b0 + form[j + _F2] * b1 + form[j + _F3] * b2
         g1 = form[j + _F0] + form[j + _F1] * e0 + form[j + _F2] * e1 + form[j + _F3] * e2
-        hit = 1.0 if (g0 >= -_BEHIND) & (g1 < 0) & (g0 > g1) else 0.0
+        hit = 1.0 if (g0 >= -BEHIND) & (g1 < 0) & (g0 > g1) else 0.0
         form[j + _OT] += hit
         form[j + to] = hit
 
@@ -124,7 +124,7 @@ def _hits(form, size, to, b, e, s, share, length, limit, sloped):
         j = np.uintp(i)
         g0 = form[j + _F0] + form[j + _F1] * b0 + form[j + _F2] * b1 + form[j + _F3] * b2
         g1 = form[j + _F0] + form[j + _F1] * e0 + form[j + _F2] * e1 + form[j + _F3] * e2
-        hit = 1.0 if (g0 >= -_BEHIND) & (g1 < 0) & (g0 > g1) else 0.0
+        hit = 1.0 if (g0 >= -BEHIND) & (g1 < 0) & (g0 > g1) else 0.0
         path = share * min(max(g0 / max(g0 - g1, 1e-9), 0.0), 1.0)
         tau = form[j + _OD] * length * path
         kept, _, bend = attenuations(tau, limit)
@@ -166,7 +166,7 @@ def _paths(form, size, to, b, s, share, length, spacing, limit, onward, sloped):
             # From the middle of the path on to the element's plane.
             towards = -(form[j + _F1] * s0 + form[j + _F2] * s1 + form[j + _F3] * s2)
             height = form[j + _OH] + form[j + _F1] * b0 + form[j + _F2] * b1 + form[j + _F3] * b2
-            time = min(max((height - (start + free / 2) * towards) / max(towards, 1e-6), 0.0), _ONWARD)
+            time = min(max((height - (start + free / 2) * towards) / max(towards, 1e-6), 0.0), ONWARD)
             time *= min(max(extinction * spacing / THIN - 1, 0.0), 1.0)
             tau = extinction * length * time
             kept, _, bend = attenuations(tau, limit)
