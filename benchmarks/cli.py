@@ -278,30 +278,40 @@ def gradient(size: int, directions: int, cells: int, pixels: int, repeats: int, 
 @click.option("--bands", type=_at_least(1), multiple=True, default=(1, 3), show_default=True, help="Of the sweeps.")
 @click.option("--rtol", type=float, default=1e-3, show_default=True, help="Certified error of the solves.")
 @click.option("--repeats", type=_at_least(1), default=5, show_default=True, help="Timed runs after the first.")
+@click.option(
+    "--case",
+    "cases",
+    multiple=True,
+    type=click.Choice(["vacuum", "homogeneous", "heterogeneous", "ring", "three-balls", "room"]),
+    help="Only sweeps of this case, or solves of this scene; may be repeated.",
+)
 @_json
 def speed(
     quick: bool, sizes: tuple[int, ...], counts: tuple[int, ...], bands: tuple[int, ...], rtol: float, repeats: int,
-    json_file: Path | None,
+    cases: tuple[str, ...], json_file: Path | None,
 ) -> None:  # fmt: skip
     """Time of sweeps, bounces and whole solves, how it grows with size and directions, and what skipped work would take."""
     from .record import environment, write
     from .skipped import skipped, skipped_table
-    from .speed import solves, speed_table, sweeps
+    from .speed import CASES, SCENES, roofline, solves, speed_table, sweeps
 
     sizes = sizes or ((8, 16) if quick else (32, 64))
     counts = counts or ((60,) if quick else (200,))
     records = []
+    chosen = lambda names: [name for name in names if not cases or name in cases]
     for made in (
-        sweeps(sizes, counts, bands, repeats, _tell),
-        solves(sizes, counts[0], rtol, repeats, _tell),
-        skipped(sizes[len(sizes) // 2], counts[0], rtol, repeats, _tell),
+        roofline(repeats, _tell),
+        sweeps(chosen(CASES), sizes, counts, bands, repeats, _tell),
+        solves(chosen(SCENES), sizes, counts[0], rtol, repeats, _tell),
+        () if cases else skipped(sizes[len(sizes) // 2], counts[0], rtol, repeats, _tell),
     ):
         for record in made:
             records.append(record)
             write(json_file, _QUESTIONS["speed"], records, environment=environment())
     _print_environment(environment())
     click.echo(speed_table(records))
-    click.echo("\n" + skipped_table(records))
+    if not cases:
+        click.echo("\n" + skipped_table(records))
 
 
 @main.command()

@@ -2,10 +2,11 @@
 
 Times of sweeps are given in nanoseconds for each voxel and direction, all bands together. In vacuum a bounce needs no sweep:
 its links tell who sees whom, found once at the price given. "by XLA" is the same sweep without the loops of our own that numba
-compiles: where it is not installed, both are the same. Every row is measured in a process of its own, alternating the variants;
-medians of warm runs.
+compiles, where there are any. Every row is measured in a process of its own, alternating the variants; medians of warm runs.
 
-Public names: `sweeps`, `solves`, `speed_table`, `CASES`, `SCENES`.
+The roofline is the time in which memory copies a ray once a plane: no sweep that keeps its rays there takes less. A cache does.
+
+Public names: `roofline`, `sweeps`, `solves`, `speed_table`, `CASES`, `SCENES`.
 """
 
 import math
@@ -21,13 +22,24 @@ CASES = ("vacuum", "homogeneous", "heterogeneous")
 SCENES = ("ring", "three-balls", "room")
 
 
+def roofline(repeats: int, tell: Callable[[str], None]) -> Iterator[dict[str, Any]]:
+    """One record: bytes read and written a second, where a copy is far larger than any cache."""
+    tell("roofline")
+    yield alone(_roofline, repeats)
+
+
 def sweeps(
-    sizes: Iterable[int], counts: Iterable[int], bands: Iterable[int], repeats: int, tell: Callable[[str], None]
+    cases: Iterable[str],
+    sizes: Iterable[int],
+    counts: Iterable[int],
+    bands: Iterable[int],
+    repeats: int,
+    tell: Callable[[str], None],
 ) -> Iterator[dict[str, Any]]:
     """One record for each case, size, number of directions and number of bands."""
-    counts, bands = list(counts), list(bands)
+    cases, counts, bands = list(cases), list(counts), list(bands)
     for size in sizes:
-        for case in CASES:
+        for case in cases:
             for count in counts:
                 for number in bands:
                     tell(f"sweep, {case}, {size} voxels, {count} directions, bands: {number}")
@@ -35,13 +47,27 @@ def sweeps(
 
 
 def solves(
-    sizes: Iterable[int], count: int, rtol: float, repeats: int, tell: Callable[[str], None]
+    scenes: Iterable[str], sizes: Iterable[int], count: int, rtol: float, repeats: int, tell: Callable[[str], None]
 ) -> Iterator[dict[str, Any]]:
     """One record for each scene and size: whole solves, light from sources included."""
+    scenes = list(scenes)
     for size in sizes:
-        for name in SCENES:
+        for name in scenes:
             tell(f"solve, {name}, {size} voxels")
             yield alone(_solve, name, size, count, rtol, repeats)
+
+
+def _roofline(repeats: int) -> dict[str, Any]:
+    import jax
+    import jax.numpy as jnp
+
+    field, seconds = jnp.ones(1 << (26 if jax.default_backend() == "cpu" else 29), jnp.float32), []
+    copied = jax.jit(lambda a: a + 1)
+    for _ in range(repeats + 1):
+        began = time.perf_counter()
+        jax.block_until_ready(copied(field))
+        seconds.append(time.perf_counter() - began)
+    return {"kind": "roofline", "bytes_a_second": 2 * field.nbytes / statistics.median(seconds[1:])}
 
 
 def _sweep(case: str, size: int, count: int, bands: int, repeats: int) -> dict[str, Any]:
@@ -77,7 +103,9 @@ def _sweep(case: str, size: int, count: int, bands: int, repeats: int) -> dict[s
         finally:
             native.serves = serves
 
-    works = {"sweep": lambda: transport(light), "by XLA": by_xla}
+    works = {"sweep": lambda: transport(light)}
+    if native.serves(transport.layout, transport.ordinates, light):
+        works["by XLA"] = by_xla
     if transport.links is not None:
         works["bounce"] = lambda: transport(light, fluence=False)
     asked = Light(light.elements) if transport.links is not None else light
@@ -127,12 +155,16 @@ def _solve(name: str, size: int, count: int, rtol: float, repeats: int) -> dict[
 
 def speed_table(records: list[dict[str, Any]]) -> str:
     """Sweeps, then solves, then how their time grows."""
+    lines = []
+    for r in (r for r in records if r["kind"] == "roofline"):
+        rate = r["bytes_a_second"]
+        lines += [f"memory copies at {rate / 1e9:.0f} GB/s: a ray of one band once a plane in {8e9 / rate:.4f} ns", ""]
     swept = [r for r in records if r["kind"] == "sweep"]
     solved = [r for r in records if r["kind"] == "solve"]
     names = ("sweep", "by XLA", "bounce", "transposed", "finding links")
-    lines = [f"{'ns a voxel-direction':22}{'size':>5}{'dirs':>6}{'bands':>6}" + "".join(f"{n:>15}" for n in names)]
+    lines += [f"{'ns a voxel-direction':22}{'size':>5}{'dirs':>6}{'bands':>6}" + "".join(f"{n:>15}" for n in names)]
     for r in swept:
-        cells = "".join(f"{r['nanoseconds'][n]:15.2f}" if n in r["nanoseconds"] else f"{'':15}" for n in names)
+        cells = "".join(f"{_figures(r['nanoseconds'][n]):>15}" if n in r["nanoseconds"] else f"{'':15}" for n in names)
         lines.append(f"{r['case']:22}{r['size']:5}{r['directions']:6}{r['bands']:6}{cells}")
     lines += [
         "",
@@ -144,6 +176,10 @@ def speed_table(records: list[dict[str, Any]]) -> str:
         for r in solved
     ]
     return "\n".join([*lines, "", *_growth(swept), *_growth_of_solves(solved)])
+
+
+def _figures(value: float) -> str:
+    return f"{value:.2f}" if value >= 0.1 else f"{value:.4f}"
 
 
 def _growth(swept: list[dict[str, Any]]) -> list[str]:
