@@ -18,6 +18,7 @@ PAIRS = {
     "an even medium: exponentials once a plane": "an uneven one",
     "a medium in the lower half": "everywhere",
     "black surfaces, pure absorber: one flight": "grey surfaces, scattering",
+    "a sky above alone: a flight of half the directions": "all around",
     "one band for grey": "three equal bands",
     "sun moved: resolve": "solve",
     "albedo changed: resolve": "solve",
@@ -97,6 +98,10 @@ def _works(name: str, size: int, quadrature: Any, rtol: float) -> tuple[Callable
         return always(of(fog, rm.Medium(3.0 * below, 0.3 * below))), always(fog)
     if name.startswith("black"):
         return always(of(fog, rm.Medium(0.0, 3.3), 0.0)), always(of(fog, rm.Medium(3.0, 0.3), 0.5))
+    if name.startswith("a sky"):
+        black = [rm.Solid(s.shape, 0.0) for s in fog.solids]
+        under = lambda sky: rm.Scene(fog.lattice, black, rm.Medium(0.0, 3.3), [sky])
+        return always(under(rm.Sky(1.0, hemisphere=(0, 0, 1)))), always(under(rm.Sky(1.0)))
     if name.startswith("one band"):
         return always(fog), always(of(fog, rm.Medium([3.0] * 3, 0.3)))
     turned = name.startswith("sun")

@@ -123,6 +123,19 @@ def test_transpose(name):
             _close(back(found[2]), back(expected[2]), case.free)
 
 
+@pytest.mark.parametrize("name", ["vacuum", "around an axis, mirrored"])
+def test_light_that_only_comes_in_is_swept_where_it_does(name):
+    case = _Case(_SCENES[name]())
+    towards = np.random.default_rng(4).uniform(size=case.inflow.radiance.shape[1]) < 0.5  # half of the sky is dark
+    inflow = Inflow(case.inflow.radiance * towards[:, None], case.inflow.factor)
+    given = *case.known, 0 * case.elements, None if case.voxels is None else 0 * case.voxels, None, inflow
+    axes = range(3)
+    lines = [native._axis(case.layout, case.transport.ordinates[axis], axis) for axis in axes]
+    lit = [native._lit(case.layout, line, axis, inflow) for axis, line in zip(axes, lines, strict=True)]
+    assert 0 < sum(map(len, lit)) < 0.6 * sum(len(line.ways.weight) for line in lines)
+    _close(native.sweep(case.manner, *given), derivative._sweep_program(case.manner, *given), case.free)
+
+
 def test_without_fluence():
     case = _Case(_SCENES["thick uneven fog in two bands"]())
     given = *case.known, case.elements, case.voxels, None, case.inflow

@@ -109,6 +109,7 @@ def sweep(
     sloped = slopes is not None
     at_elements = np.zeros((bands, layout.elements))
     in_voxels = np.zeros((bands, *layout.padded), real)
+    dark = not sent.any() and (volume is None or not volume.any())
 
     def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
         planes, cut, hits, probes = arguments
@@ -132,7 +133,7 @@ def sweep(
                 code.forwards(*known, _work(code, line, directions, real), *sums, voxels)
             return sums, voxels
 
-        for sums, voxels in on_cores(run, line.parts):
+        for sums, voxels in on_cores(run, _shared(_lit(layout, line, axis, inflow)) if dark else line.parts):
             for of_kind, of_readers in zip(readers, sums, strict=True):
                 at_elements[:] += [np.bincount(of_kind.element, band, layout.elements) for band in of_readers]
             if manner.fluence:
@@ -423,11 +424,31 @@ def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
         _readers(code, reads, marked(bits, wanted), number, surface, cut)
         for reads, bits, wanted in zip(layout.reads[axis].kinds, (own.hit_bits, own.probe_bits), (1, 0), strict=True)
     )
-    # A core takes directions from all over, sorted by sense: the two senses meet planes in opposite order.
-    numbers = np.argsort(-ways.sense, kind="stable")
-    parts = tuple(part for first in range(count_cores()) if len(part := numbers[first :: count_cores()]))
+    # Sorted by sense: the two senses meet planes in opposite order.
+    parts = _shared(np.argsort(-ways.sense, kind="stable"))
     line = _frozen((ways, parts, shape, cut, ghosts, ~surface & ~ghost, hits, probes))
     return _Axis(*line, at(np.nonzero(~in_ghost)[0]), at(np.nonzero(in_ghost)[0]))
+
+
+def _shared(numbers: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Directions for each core, from all over; sorted by sense, they stay so."""
+    return tuple(part for first in range(count_cores()) if len(part := numbers[first :: count_cores()]))
+
+
+def _lit(layout: Layout, line: _Axis, axis: int, inflow: Inflow | None) -> Int[np.ndarray, " n"]:
+    """Of the directions those in which light comes in, where it comes from nowhere else."""
+    numbers = np.concatenate(line.parts)
+    if inflow is None:
+        return numbers[:0]
+    ways, is_open = line.ways, np.asarray(layout.inflow_image) >= 0
+    shines = (np.asarray(inflow.radiance) != 0).any((0, 2))[ways.index]
+    enters = np.zeros(len(shines), bool)
+    for place, a in enumerate(AXES[axis]):
+        for end, inward in ((0, 1), (-1, -1)):
+            if layout.pad[a] and is_open.take(end, a).any():
+                enters |= inward * ways.toward[:, place] > 0
+    numbers = numbers[(shines & enters)[numbers]]
+    return numbers[np.argsort(-ways.sense[numbers], kind="stable")]
 
 
 def _flat(cells: machine_code.Cells, area: int) -> np.ndarray:
