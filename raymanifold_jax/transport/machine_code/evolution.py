@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from numba.extending import register_jitable
 
-from .paths import chords, compiled, entry, join_ends, turn
+from .compiling import compiled, entry
+from .paths import chords, join_ends, turn
 from .readers import ask, read
 from .voxels import from_ghosts, put_cut, take_cut, through_cut, through_free
 from .voxels_back import back_cut, back_free, back_ghosts, give_cut, keep_cut

@@ -6,7 +6,8 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ..characteristic import _BEHIND
-from .paths import chords, entry
+from .compiling import entry
+from .paths import chords
 from .readers import height_of, tilt
 
 

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numba
 import numpy as np
 from numba.extending import overload, register_jitable
 
-# Without numba's reference counts, which would take longer than the work: what is allocated comes from outside.
-_options: Any = dict(cache=True, fastmath={"contract", "nsz"}, error_model="numpy", _nrt=False, no_cfunc_wrapper=True)
-entry: Any = numba.njit(nogil=True, **_options)
-# Called by entries only. Numba would compile a way in from Python for each, which takes apart all the tuples.
-compiled: Any = numba.njit(no_cpython_wrapper=True, **_options)
+from .compiling import compiled
 
 
 def exp(x):

@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from numba.extending import register_jitable
 
+from .compiling import compiled, entry
 from .evolution import most_laps
-from .paths import chords, compiled, entry
+from .paths import chords
 from .readers import BLOCK, ROWS, add_each, forms_of, pick_marked, take, tilt
 from .voxels import ghost_light, put_cut
 
