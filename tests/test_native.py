@@ -5,6 +5,7 @@ Numbers in solids are left out: nobody reads them, and rays there are not the sa
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 
 import jax
@@ -178,6 +179,25 @@ def test_a_plain_install_gives_the_same_light(monkeypatch):
     expected = rm.solve(scene, rm.quadrature.fibonacci(40), rtol=1e-8, progress=False)
     np.testing.assert_allclose(found.fluence, expected.fluence, rtol=1e-7)
     np.testing.assert_allclose(found.surfaces.irradiance, expected.surfaces.irradiance, rtol=0, atol=1e-7)
+
+
+def test_processes_compile_one_at_a_time():
+    fcntl = pytest.importorskip("fcntl", reason="locks of files")
+    from raymanifold_jax.transport.machine_code.compiling import entry, lock_of
+
+    program = entry(_twice)
+    with lock_of(program).open("a") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        waiting = threading.Thread(target=program, args=(1.0,))
+        waiting.start()
+        waiting.join(0.5)
+        assert waiting.is_alive()
+    waiting.join()
+    assert program(1.0) == 2.0
+
+
+def _twice(x):
+    return 2 * x
 
 
 def test_a_numba_that_does_not_import_is_told_and_left_alone(monkeypatch):

@@ -6,7 +6,8 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ..reading import BEHIND
-from .paths import chords, compiled
+from .compiling import entry
+from .paths import chords
 from .readers import height_of, tilt
 
 
@@ -34,7 +35,7 @@ def _clean(around, elements, i, k, number, sense, way):
     return above + around.planes[3, before] * (way.begin[number, 2] + along_v) > -1e-3
 
 
-@compiled
+@entry
 def mark(chosen, ways, around, elements, chunk, place, way, bits):
     """Set the bits [G, words, I] of the `chosen` directions, which have a `place` in a `chunk` each."""
     for n in chosen:
@@ -58,7 +59,7 @@ def mark(chosen, ways, around, elements, chunk, place, way, bits):
                     bits[g, word, i] |= bit
 
 
-@compiled
+@entry
 def pack(chosen, ways, words, wanted, chunk, place, image, face, bits):
     """Set the bits [N, M / 8] of readers in the `chosen` directions: where those of their `image` in `words` [G, words, I] are
     `wanted`, and light comes from before their `face`."""

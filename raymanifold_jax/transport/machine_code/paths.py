@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numba
 import numpy as np
 from numba.extending import overload, register_jitable
 
-# Without numba's reference counts, which would take longer than the work: what is allocated comes from outside.
-compiled: Any = numba.njit(  # pyright: ignore[reportCallIssue]
-    nogil=True, cache=True, fastmath={"contract", "nsz"}, error_model="numpy", _nrt=False
-)
+from .compiling import compiled
 
 
 def exp(x):

@@ -13,7 +13,8 @@ from numba.extending import register_jitable
 
 from ..reading import BEHIND, ONWARD
 from ..slopes import THIN
-from .paths import bend_of, compiled, exp, mean_of
+from .compiling import compiled
+from .paths import bend_of, exp, mean_of
 
 BLOCK = 128
 #: Rows of the array that follow the form: what it is multiplied by, how many hits or how much of paths, the elements' surfaces

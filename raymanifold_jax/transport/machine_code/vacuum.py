@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from numba.extending import register_jitable
 
+from .compiling import compiled, entry
 from .evolution import most_laps
-from .paths import chords, compiled
+from .paths import chords
 from .readers import BLOCK, ROWS, add_each, forms_of, pick_marked, take, tilt
 from .voxels import ghost_light, put_cut
 
@@ -139,7 +140,7 @@ def _read(paths, readers, picked, ways, n, count, way, seen, emitted, manner, fo
             sums[readers_here[i]] += total[i]
 
 
-@compiled
+@entry
 def in_vacuum(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, work, at_hits, at_probes, in_voxels):
     """As `evolution.forwards`, without a medium."""
     count, bands, size = planes.even.shape[0], planes.even.shape[1], planes.height * planes.width
@@ -219,7 +220,7 @@ def _note_links(paths, readers, picked, ways, n, count, way, numbers, sent, mann
     return links
 
 
-@compiled
+@entry
 def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut, of_ghosts, element, source, weight):
     """Rays that carry the number of the voxel they left, and which of these elements read (see `transport.links`).
 
@@ -259,7 +260,7 @@ def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut,
     return links
 
 
-@compiled
+@entry
 def follow(first, last, to, of, weight, sent, got):
     """Add the weight of links `first` to `last` times what is sent [C, n] to what is got [C, m]."""
     for c in range(sent.shape[0]):

@@ -5,7 +5,8 @@ from __future__ import annotations
 from numba.extending import register_jitable
 
 from .arguments import EVEN, PATCHY
-from .paths import attenuation, bend_of, compiled, exp, mean_of, middle_and_whole
+from .compiling import compiled
+from .paths import attenuation, bend_of, exp, mean_of, middle_and_whole
 
 
 @compiled
