@@ -464,9 +464,13 @@ def _use_cache() -> str | None:
             directory = None
     import jax
 
+    from .programs import keep_in
+
     jax.config.update("jax_compilation_cache_dir", directory)
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", _CACHED_FROM)
+    own = "RAYMANIFOLD_CACHE" in os.environ or "JAX_COMPILATION_CACHE_DIR" not in os.environ
+    keep_in(directory if own else None)
     return directory
 
 

@@ -16,7 +16,6 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +24,7 @@ from jaxtyping import Array, Float
 
 from . import checks
 from .arrays import real_dtype
+from .programs import program
 from .scene import MIRROR, PERIODIC, Scene
 
 _BLOCK = 1 << 14  # rays a call
@@ -140,15 +140,20 @@ def in_blocks(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
     arrays = tuple(_padded(np.asarray(a, real), block, np) for a in arrays)
     call = _jitted_again if checks.is_traced(scene) else _jitted
     parts = [call(function, scene, tuple(a[i : i + block] for a in arrays)) for i in range(0, len(arrays[0]), block)]
+    return parts[0] if len(arrays[0]) == count == block else _joined(tuple(parts), count)
+
+
+@program
+def _joined(parts: tuple, count: int) -> Any:
     return jax.tree.map(lambda *r: jnp.concatenate(r)[:count], *parts)
 
 
-@eqx.filter_jit
+@program
 def _jitted(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
     return _in_bundles(function, scene, arrays)
 
 
-@eqx.filter_jit
+@program
 def _jitted_again(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
     """The same for derivatives: what rays meet is worked out again backwards, not kept."""
     return _in_bundles(jax.checkpoint(function), scene, arrays)  # pyright: ignore[reportPrivateImportUsage]
