@@ -316,7 +316,7 @@ def _film(views: "Mapping[str, View]", around: int | None, through: int | None, 
 
 def _build(entry: "SceneEntry", size: int, directions: int) -> "Scene":
     """The scene, if its solve fits into memory."""
-    _use_cache()
+    _use_cache(f"{entry.name} {size} {directions}")
     from .memory import check_memory
 
     scene = entry.build(size)
@@ -453,8 +453,8 @@ def _cache_directory(environment: Mapping[str, str]) -> str | None:
     return str(base / "raymanifold")
 
 
-def _use_cache() -> str | None:
-    """Have JAX keep compiled programs; the directory, or None."""
+def _use_cache(task: str = "") -> str | None:
+    """Have compiled programs kept; the directory, or None."""
     directory = _cache_directory(os.environ)
     if directory is not None:
         try:
@@ -470,7 +470,7 @@ def _use_cache() -> str | None:
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", _CACHED_FROM)
     own = "RAYMANIFOLD_CACHE" in os.environ or "JAX_COMPILATION_CACHE_DIR" not in os.environ
-    keep_in(directory if own else None)
+    keep_in(directory if own else None, task)
     return directory
 
 

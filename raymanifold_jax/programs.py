@@ -30,7 +30,8 @@ import sys
 import types
 import zlib
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -51,25 +52,32 @@ _VERSIONED = (jax, jaxlib, eqx, np)
 _KNOWN = {__name__.partition(".")[0], *(package.__name__ for package in _VERSIONED), *sys.stdlib_module_names}
 _FAST = 1  # of zlib's levels
 
-_folder: Path | None = None
+_folder: _Folder | None = None
 
 
-def keep_in(directory: str | os.PathLike[str] | None) -> None:
-    """Keep the programs of this process in a folder in this directory, or nowhere. The command line does."""
+def keep_in(directory: str | os.PathLike[str] | None, task: str = "") -> None:
+    """Keep the programs of this process in a folder in this directory, or nowhere. The command line does.
+
+    What the last process with this `task` came to use is loaded ahead, beside what else there is to do.
+    """
     global _folder
     _folder = None
-    if directory is not None:
-        folder = Path(directory) / "programs"
+    if directory is not None and _on_one_cpu():
+        path = Path(directory) / "programs"
         try:
-            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            _folder = folder if _is_own(folder) else None
+            path.mkdir(mode=0o700, parents=True, exist_ok=True)
+            _folder = _Folder(path, task) if _is_own(path) else None
         except OSError:  # then JAX has no cache there either
-            pass
+            return
 
 
-def _is_own(folder: Path) -> bool:
+def _on_one_cpu() -> bool:
+    return [device.platform for device in jax.devices()] == ["cpu"]
+
+
+def _is_own(path: Path) -> bool:
     """Whether nobody else can write there."""
-    status = folder.stat()
+    status = path.stat()
     return not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
 
 
@@ -80,14 +88,14 @@ def program(function: Callable[..., R]) -> Callable[..., R]:
 
     @functools.wraps(function)
     def call(*arguments: Any, **named: Any) -> R:
-        if _folder is None or not _on_one_cpu():
+        if _folder is None:
             return compiling(*arguments, **named)
         leaves, tree = jax.tree.flatten((arguments, named))
         if checks.is_traced(leaves):
             return compiling(*arguments, **named)
-        known = [_Array.like(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves]
-        key = tree, tuple((type(leaf), leaf) for leaf in known), real_dtype()
+        key = tree, tuple(map(_kind, leaves)), real_dtype()
         if key not in ready:
+            known = [_Array.like(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves]
             ready[key] = _find(_folder, function, tree, known)
         run = ready[key]
         return compiling(*arguments, **named) if run is None else run([leaf for leaf in leaves if eqx.is_array(leaf)])
@@ -95,9 +103,9 @@ def program(function: Callable[..., R]) -> Callable[..., R]:
     return call
 
 
-@functools.cache
-def _on_one_cpu() -> bool:
-    return [device.platform for device in jax.devices()] == ["cpu"]
+def _kind(leaf: Any) -> Hashable:
+    """What is looked at in every call."""
+    return (leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)) if eqx.is_array(leaf) else (type(leaf), leaf)
 
 
 @dataclass(frozen=True)
@@ -121,15 +129,20 @@ class _Result:
     """Stands for an array in what a function returns."""
 
 
-def _find(folder: Path, function: Callable, tree: Any, known: list) -> Callable[[Sequence], Any] | None:
+def _find(folder: _Folder, function: Callable, tree: Any, known: list) -> Callable[[Sequence], Any] | None:
     """The program for these arguments, from the folder or made now; None if it cannot be kept."""
     name = f"{function.__module__}.{function.__qualname__}"
     try:
         made_from = _pickled((name, tree.unflatten(known), str(real_dtype())))
     except (pickle.PicklingError, TypeError, AttributeError):  # pickle has several for what has no name
         return None
-    file = folder / f"{name}-{hashlib.sha256(_circumstances() + made_from).hexdigest()}"
-    return _load(file, sum(isinstance(k, _Array) for k in known)) or _make(file, function, tree, known)
+    file = folder.path / f"{name}-{_digest(made_from)}"
+    loaded = folder.load(file)
+    return _make(file, function, tree, known) if loaded is None else _runner(loaded[0], pickle.loads(loaded[1]))
+
+
+def _digest(made_from: bytes) -> str:
+    return hashlib.sha256(_circumstances() + made_from).hexdigest()
 
 
 class _Pickler(pickle.Pickler):
@@ -169,14 +182,32 @@ def _processor() -> list[str]:
     return sorted({line for line in described.read_text().splitlines() if line.startswith(kinds)})
 
 
-def _load(file: Path, arguments: int) -> Callable[[Sequence], Any] | None:
-    """The program in a file; None if there is none that can be used."""
+def _load(file: Path) -> tuple[Callable, bytes] | None:
+    """The program in a file, and the form of its results; None if there is none that can be used."""
     try:
-        results, executable = pickle.loads(zlib.decompress(file.read_bytes()))  # with a checksum
-        trees = jax.tree.structure(((0,) * arguments, {})), jax.tree.structure([0] * _count(results))
-        return _runner(serialize_executable.deserialize_and_load(executable, *trees), results)
+        arguments, arrays, results, executable = pickle.loads(zlib.decompress(file.read_bytes()))  # with a checksum
+        trees = jax.tree.structure(((0,) * arguments, {})), jax.tree.structure([0] * arrays)
+        return serialize_executable.deserialize_and_load(executable, *trees), results
     except (OSError, zlib.error, jax.errors.JaxRuntimeError):
         return None
+
+
+class _Folder:
+    """Files of programs. A list tells which ones a task uses, in the order of their first use: a thread loads them ahead."""
+
+    def __init__(self, path: Path, task: str):
+        self.path = path
+        self._list = path / f"task-{_digest(task.encode())}"
+        names = self._list.read_text().split() if self._list.exists() else []
+        pool = ThreadPoolExecutor(1, "programs")
+        self._coming = {name: pool.submit(_load, path / name) for name in dict.fromkeys(names)}
+
+    def load(self, file: Path) -> tuple[Callable, bytes] | None:
+        if file.name in self._coming:
+            return self._coming.pop(file.name).result()
+        with suppress(OSError), self._list.open("a") as names:
+            names.write(f"{file.name}\n")
+        return _load(file)
 
 
 def _make(file: Path, function: Callable, tree: Any, known: list) -> Callable[[Sequence], Any]:
@@ -196,8 +227,9 @@ def _make(file: Path, function: Callable, tree: Any, known: list) -> Callable[[S
         compiled = lowered.compile()
     results = returned[-1]
     try:
-        content = zlib.compress(pickle.dumps((results, serialize_executable.serialize(compiled)[0])), _FAST)
-        _write(file, content)
+        counts = sum(isinstance(k, _Array) for k in known), sum(isinstance(leaf, _Result) for leaf in jax.tree.leaves(results))
+        whole = *counts, pickle.dumps(results), serialize_executable.serialize(compiled)[0]
+        _write(file, zlib.compress(pickle.dumps(whole), _FAST))
     except (OSError, ValueError, NotImplementedError, jax.errors.JaxRuntimeError):  # a full disk, or callbacks
         pass
     return _runner(compiled, results)
@@ -222,10 +254,6 @@ def _write(file: Path, content: bytes) -> None:
         os.replace(temporary, file)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def _count(results: Any) -> int:
-    return sum(isinstance(leaf, _Result) for leaf in jax.tree.leaves(results))
 
 
 def _runner(compiled: Callable, results: Any) -> Callable[[Sequence], Any]:

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import textwrap
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +35,10 @@ def folder(tmp_path, monkeypatch):
     keep_in(None)
 
 
+def kept(folder) -> list[Path]:
+    return sorted(file for file in folder.iterdir() if not file.name.startswith("task-"))
+
+
 def in_a_new_process(*arguments, **named):
     """The result of a program that this process has not met, and how often it was traced."""
     before = len(traced)
@@ -52,7 +57,7 @@ def same(found, expected) -> None:
 def test_a_second_start_traces_nothing_and_has_the_same_numbers(folder):
     expected = weighted(light(), 3.0)
     first, count = in_a_new_process(light(), 3.0)
-    assert count == 1 and len(list(folder.iterdir())) == 1
+    assert count == 1 and len(kept(folder)) == 1
     second, count = in_a_new_process(light(), 3.0)
     assert count == 0
     same(first, second)
@@ -75,7 +80,7 @@ def test_other_arguments_are_another_program(folder, other):
     in_a_new_process(light(), 3.0)
     found, count = in_a_new_process(*other)
     assert count == 1 and found[1]["factor"] == other[1]
-    assert len(list(folder.iterdir())) == 2
+    assert len(kept(folder)) == 2
     assert in_a_new_process(*other)[1] == 0
 
 
@@ -109,12 +114,28 @@ def test_what_all_programs_depend_on(monkeypatch):
 @pytest.mark.parametrize("damage", [lambda whole: b"", lambda whole: whole[:-9], lambda whole: whole[:99] + b"?" + whole[100:]])
 def test_a_damaged_file_is_replaced(folder, damage):
     expected, _ = in_a_new_process(light())
-    (file,) = folder.iterdir()
+    (file,) = kept(folder)
     file.write_bytes(damage(file.read_bytes()))
     found, count = in_a_new_process(light())
     assert count == 1
     same(found, expected)
-    assert in_a_new_process(light())[1] == 0 and list(folder.iterdir()) == [file]
+    assert in_a_new_process(light())[1] == 0 and kept(folder) == [file]
+
+
+def test_what_a_task_used_is_loaded_ahead(folder):
+    """In the order of first use; what is not there any more is made again, and what is not asked for does no harm."""
+    keep_in(folder.parent, "a task")
+    expected = [in_a_new_process(light(n))[0] for n in (3, 4, 5)]
+    (task,) = folder.glob("task-*")
+    names = task.read_text().split()
+    assert sorted(names) == [file.name for file in kept(folder)]
+    (folder / names[1]).unlink()
+    keep_in(folder.parent, "a task")
+    found, counts = zip(*(in_a_new_process(light(n)) for n in (3, 4)), strict=True)
+    same(list(found), expected[:2])
+    assert counts == (0, 1) and task.read_text().split() == names
+    keep_in(folder.parent, "another task")
+    assert in_a_new_process(light(5))[1] == 0 and len(list(folder.glob("task-*"))) == 2
 
 
 def test_where_jax_traces_programs_step_aside(folder):
@@ -124,7 +145,7 @@ def test_where_jax_traces_programs_step_aside(folder):
     same(jax.grad(total)(values), jax.grad(lambda v: weighted(Light(v))[1]["sum"])(values))
     np.testing.assert_allclose(jax.jit(total)(values), total(values), rtol=1e-6)
     np.testing.assert_allclose(jax.vmap(total)(values[None]), [total(values)], rtol=1e-6)
-    assert len(list(folder.iterdir())) == 1  # of the calls outside
+    assert len(kept(folder)) == 1  # of the calls outside
 
 
 def test_functions_of_others_are_not_known_by_their_names(folder, monkeypatch):
@@ -133,7 +154,7 @@ def test_functions_of_others_are_not_known_by_their_names(folder, monkeypatch):
     found, count = in_a_new_process(light(), also=light)
     assert count == 1 and found[1]["factor"] == 2.0
     assert in_a_new_process(light(), also=lambda: 1)[1] == 1
-    assert not list(folder.iterdir())
+    assert not kept(folder)
 
 
 def test_results_that_are_arguments(folder):
