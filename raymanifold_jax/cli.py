@@ -7,6 +7,7 @@ all the same) or the machine gave out; 2 for a value that cannot be used.
 Public name: `main`.
 """
 
+import gc
 import itertools
 import math
 import os
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from .solution import Solution
 
 _BRIGHT, _BRIGHT_SHARE = 0.9, 99.0  # auto exposure: this percentile of the radiance becomes this much of white
+_NEW_OBJECTS = 10_000  # between looks for garbage; Python's 700 cost a quarter of a short run, of which most is imports
 _CACHED_FROM = 0.02  # seconds: programs that compile faster are not kept; the many small ones add up
 
 
@@ -59,6 +61,9 @@ def main(ctx: click.Context) -> None:
     # The library's warnings in one line each, without the place in its code.
     ctx.with_resource(warnings.catch_warnings())
     warnings.showwarning = _show_warning
+    before = gc.get_threshold()
+    gc.set_threshold(_NEW_OBJECTS)
+    ctx.call_on_close(lambda: gc.set_threshold(*before))
 
 
 @main.command()

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .arrays import as_jax, zeros_like
+from .arrays import zeros_like
 from .operator import Light
 from .programs import program
 
@@ -135,4 +135,4 @@ def _sum(weights: tuple[Array, ...], fields: tuple[Light, ...]) -> Light:
 def combine(weights, fields: list[Light]) -> Light:
     """The sum of `fields`, each times its weight."""
     real = fields[0].elements.dtype
-    return _sum(tuple(as_jax(w, real) for w in weights), tuple(fields))
+    return _sum(tuple(np.asarray(w, real) for w in weights), tuple(fields))
