@@ -459,7 +459,10 @@ def _cache_directory(environment: Mapping[str, str]) -> str | None:
 
 
 def _use_cache(task: str = "") -> str | None:
-    """Have compiled programs kept; the directory, or None."""
+    """Have compiled programs kept; the directory, or None.
+
+    Whole ones too (`programs`), but in a directory of JAX's own setting, where it alone has a say.
+    """
     directory = _cache_directory(os.environ)
     if directory is not None:
         try:
