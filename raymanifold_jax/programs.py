@@ -50,6 +50,7 @@ R = TypeVar("R")
 _VERSIONED = (jax, jaxlib, eqx, np)
 #: The packages whose functions and classes are known by their names.
 _KNOWN = {__name__.partition(".")[0], *(package.__name__ for package in _VERSIONED), *sys.stdlib_module_names}
+_NAMELESS = pickle.PicklingError, TypeError, AttributeError  # what pickle raises for what has no name
 _FAST = 1  # of zlib's levels
 
 _folder: _Folder | None = None
@@ -134,7 +135,7 @@ def _find(folder: _Folder, function: Callable, tree: Any, known: list) -> Callab
     name = f"{function.__module__}.{function.__qualname__}"
     try:
         made_from = _pickled((name, tree.unflatten(known), str(real_dtype())))
-    except (pickle.PicklingError, TypeError, AttributeError):  # pickle has several for what has no name
+    except _NAMELESS:
         return None
     file = folder.path / f"{name}-{_digest(made_from)}"
     loaded = folder.load(file)
@@ -198,7 +199,7 @@ class _Folder:
     def __init__(self, path: Path, task: str):
         self.path = path
         self._list = path / f"task-{_digest(task.encode())}"
-        names = self._list.read_text().split() if self._list.exists() else []
+        names = self._list.read_text(errors="replace").split() if self._list.exists() else []
         pool = ThreadPoolExecutor(1, "programs")
         self._coming = {name: pool.submit(_load, path / name) for name in dict.fromkeys(names)}
 
@@ -230,7 +231,7 @@ def _make(file: Path, function: Callable, tree: Any, known: list) -> Callable[[S
         counts = sum(isinstance(k, _Array) for k in known), sum(isinstance(leaf, _Result) for leaf in jax.tree.leaves(results))
         whole = *counts, pickle.dumps(results), serialize_executable.serialize(compiled)[0]
         _write(file, zlib.compress(pickle.dumps(whole), _FAST))
-    except (OSError, ValueError, NotImplementedError, jax.errors.JaxRuntimeError):  # a full disk, or callbacks
+    except (OSError, ValueError, NotImplementedError, jax.errors.JaxRuntimeError, *_NAMELESS):  # a full disk, or callbacks
         pass
     return _runner(compiled, results)
 

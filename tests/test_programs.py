@@ -134,6 +134,9 @@ def test_what_a_task_used_is_loaded_ahead(folder):
     found, counts = zip(*(in_a_new_process(light(n)) for n in (3, 4)), strict=True)
     same(list(found), expected[:2])
     assert counts == (0, 1) and task.read_text().split() == names
+    task.write_bytes(b"\xff\0 nonsense")
+    keep_in(folder.parent, "a task")
+    assert in_a_new_process(light(3))[1] == 0
     keep_in(folder.parent, "another task")
     assert in_a_new_process(light(5))[1] == 0 and len(list(folder.glob("task-*"))) == 2
 
