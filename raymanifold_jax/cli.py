@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from .solution import Solution
 
 _BRIGHT, _BRIGHT_SHARE = 0.9, 99.0  # auto exposure: this percentile of the radiance becomes this much of white
-_NEW_OBJECTS = 10_000  # between looks for garbage; Python's 700 cost a quarter of a short run, of which most is imports
+_NEW_OBJECTS = 10_000  # between looks for garbage; Python's 700 cost a quarter of the main thread's time in a short run
 _CACHED_FROM = 0.02  # seconds: programs that compile faster are not kept; the many small ones add up
 
 
