@@ -38,6 +38,7 @@ from .arrays import as_jax
 from .layout import Layout
 from .operator import Light, Materials, Transport
 from .placement import known
+from .programs import program
 from .surfaces import Surfaces
 from .transport.slopes import flattening
 
@@ -99,18 +100,18 @@ class Diffusion(eqx.Module):
         return _of_arriving_transposed(self, light)
 
 
-@eqx.filter_jit
+@program
 def _precondition(near: Diffusion, leaving: Light) -> Light:
     weighted = jax.tree.map(jnp.multiply, near.power, leaving)
     return leaving + jax.tree.map(jnp.multiply, near.albedo, _spread(near, weighted))
 
 
-@eqx.filter_jit
+@program
 def _of_arriving(near: Diffusion, light: Light) -> Light:
     return light + _spread(near, jax.tree.map(lambda g, r, x: g * r * x, near.power, near.albedo, light))
 
 
-@eqx.filter_jit
+@program
 def _of_arriving_transposed(near: Diffusion, light: Light) -> Light:
     spread = _spread_transposed(near, light)
     return light + jax.tree.map(lambda g, r, x: g * r * x, near.power, near.albedo, spread)
@@ -264,7 +265,7 @@ def _distance(solid: np.ndarray, surfaces: Surfaces, shape: tuple[int, int, int]
     return np.maximum(np.minimum(away(solid), away(beside) + 0.5), 0.5)
 
 
-@eqx.filter_jit
+@program
 def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodic: tuple[bool, ...], sloped: bool) -> Diffusion:
     real, bands = stuff.albedo.dtype, stuff.albedo.shape[0]
     free, ends, area = (x.astype(real) for x in (free, ends, area))

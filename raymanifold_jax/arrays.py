@@ -3,11 +3,13 @@
 `jnp.asarray` makes a program for every shape that it copies or converts, which takes JAX some milliseconds each at the start
 of every process; here numpy converts. So does every other operation outside of `jit`: numpy does them where numbers are known.
 
-Public: `as_jax`, `real_dtype`, `numpy_or_jax`, `numpy_or_jax_of`, `worked_out_now`, `stop_gradient`, `on_accelerator`.
+Public: `as_jax`, `zeros_like`, `ones_like`, `real_dtype`, `numpy_or_jax`, `numpy_or_jax_of`, `worked_out_now`, `stop_gradient`,
+`on_accelerator`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from types import ModuleType
 from typing import Any, TypeVar
@@ -36,6 +38,22 @@ def on_accelerator() -> bool:
     return jax.default_backend() != "cpu"
 
 
+def zeros_like(tree: T) -> T:
+    """As `jnp.zeros_like` of each array."""
+    return jax.tree.map(lambda array: _filled_like(array, np.zeros, jnp.zeros_like), tree)
+
+
+def ones_like(tree: T) -> T:
+    """As `jnp.ones_like` of each array."""
+    return jax.tree.map(lambda array: _filled_like(array, np.ones, jnp.ones_like), tree)
+
+
+def _filled_like(array: Array, filled: Callable, like: Callable) -> Array:
+    if checks.is_traced(array) or len(array.devices()) > 1 or on_accelerator():
+        return like(array)
+    return jax.device_put(filled(array.shape, array.dtype))
+
+
 def real_dtype() -> np.dtype:
     """Of real numbers as JAX is set up: float32, or float64 with its `enable_x64`."""
     return np.dtype(jax.dtypes.canonicalize_dtype(float))
@@ -53,7 +71,7 @@ def numpy_or_jax_of(array: Any) -> ModuleType:
 
 def worked_out_now() -> AbstractContextManager:
     """For what no parameter moves: it is known even while JAX stages the rest."""
-    staging = checks.is_traced(jnp.zeros(()))
+    staging = checks.is_traced(jax.device_put(np.zeros(())))
     return jax.ensure_compile_time_eval() if staging else nullcontext()
 
 

@@ -7,6 +7,7 @@ all the same) or the machine gave out; 2 for a value that cannot be used.
 Public name: `main`.
 """
 
+import gc
 import itertools
 import math
 import os
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from .solution import Solution
 
 _BRIGHT, _BRIGHT_SHARE = 0.9, 99.0  # auto exposure: this percentile of the radiance becomes this much of white
+_NEW_OBJECTS = 10_000  # between looks for garbage; Python's 700 cost a quarter of the main thread's time in a short run
 _CACHED_FROM = 0.02  # seconds: programs that compile faster are not kept; the many small ones add up
 
 
@@ -59,6 +61,9 @@ def main(ctx: click.Context) -> None:
     # The library's warnings in one line each, without the place in its code.
     ctx.with_resource(warnings.catch_warnings())
     warnings.showwarning = _show_warning
+    before = gc.get_threshold()
+    gc.set_threshold(_NEW_OBJECTS)
+    ctx.call_on_close(lambda: gc.set_threshold(*before))
 
 
 @main.command()
@@ -316,7 +321,7 @@ def _film(views: "Mapping[str, View]", around: int | None, through: int | None, 
 
 def _build(entry: "SceneEntry", size: int, directions: int) -> "Scene":
     """The scene, if its solve fits into memory."""
-    _use_cache()
+    _use_cache(f"{entry.name} {size} {directions}")
     from .memory import check_memory
 
     scene = entry.build(size)
@@ -453,8 +458,11 @@ def _cache_directory(environment: Mapping[str, str]) -> str | None:
     return str(base / "raymanifold")
 
 
-def _use_cache() -> str | None:
-    """Have JAX keep compiled programs; the directory, or None."""
+def _use_cache(task: str = "") -> str | None:
+    """Have compiled programs kept; the directory, or None.
+
+    Whole ones too (`programs`), but in a directory of JAX's own setting, where it alone has a say.
+    """
     directory = _cache_directory(os.environ)
     if directory is not None:
         try:
@@ -464,9 +472,13 @@ def _use_cache() -> str | None:
             directory = None
     import jax
 
+    from .programs import keep_in
+
     jax.config.update("jax_compilation_cache_dir", directory)
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
         jax.config.update("jax_persistent_cache_min_compile_time_secs", _CACHED_FROM)
+    own = "RAYMANIFOLD_CACHE" in os.environ or "JAX_COMPILATION_CACHE_DIR" not in os.environ
+    keep_in(directory if own else None, task)
     return directory
 
 

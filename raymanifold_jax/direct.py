@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from . import checks
-from .arrays import as_jax, numpy_or_jax, real_dtype
+from .arrays import as_jax, numpy_or_jax, real_dtype, zeros_like
 from .emitters import CLEARANCE, brighter_than, emitting_elements, point_light
 from .layout import Layout
 from .march import fill
@@ -29,6 +29,7 @@ from .partition import Partition
 from .patches import light_of_emitters, may_serve
 from .placement import stored
 from .prepare import Prepared
+from .programs import program
 from .quadrature import Quadrature
 from .scene import PointLight, Scene, Sky, Sun
 from .surfaces import Surfaces
@@ -88,7 +89,7 @@ def first_flight(
     for light in scene.lights:
         if isinstance(light, PointLight):
             swept = swept + stored(layout, _from_point(scene, surfaces, light))
-    zero = jax.tree.map(jnp.zeros_like, swept)
+    zero = zeros_like(swept)
     suns = [_from_sun(scene, surfaces, layout, light, materials, prepared) for light in scene.lights if isinstance(light, Sun)]
     return Direct(sun=sum(suns, start=zero), rest=swept, brightest=brightest(scene, None if sky is None else sky.radiance))
 
@@ -104,7 +105,7 @@ def _swept(transport: Transport, leaving: Light, sky: Inflow | None) -> Light:
     """One sweep of what leaves surfaces and medium and of the sky; none if all are dark."""
     if sky is None and not checks.may_differ_from_zero(leaving):
         shape = (leaving.elements.shape[0], *transport.layout.shape)
-        return Light(jnp.zeros_like(leaving.elements), jnp.zeros(shape, leaving.elements.dtype))
+        return Light(zeros_like(leaving.elements), as_jax(np.zeros(shape), leaving.elements.dtype))
     return transport(leaving, sky)
 
 
@@ -159,11 +160,11 @@ def _from_sun(
     radiance = here[:, None, None] * xp.broadcast_to(xp.asarray(sun.irradiance), (len(images), count, scene.bands))
     mean = transport(_dark(materials), Inflow(as_jax(radiance, real_dtype())))
     cosines = sum(np.maximum(-(surfaces.normal * signs) @ direction, 0) for _, signs in images)
-    return _of_beam(mean, as_jax(cosines, real_dtype()), float(len(images)))
+    return _of_beam(mean, as_jax(cosines, real_dtype()), as_jax(len(images), real_dtype()))
 
 
-@jax.jit
-def _of_beam(mean: Light, cosines: Float[Array, " E"], images: float) -> Light:
+@program
+def _of_beam(mean: Light, cosines: Float[Array, " E"], images: Array) -> Light:
     assert mean.voxels is not None
     return Light(mean.elements * cosines / jnp.pi, mean.voxels * (images / (4 * jnp.pi)))
 

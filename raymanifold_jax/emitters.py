@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from . import checks
 from .march import transmittance
+from .programs import program
 from .scene import MIRROR, PERIODIC, PointLight, Scene
 from .surfaces import Surfaces, patch_points
 from .texture import Texture
@@ -159,7 +160,7 @@ def point_light(
     return jnp.broadcast_to(light.intensity, (scene.bands,))[:, None] * total
 
 
-@eqx.filter_jit
+@program
 def _pairs(scene: Scene, points: EmitterPoints, position, normal) -> Float[Array, "C n"]:
     real = position.dtype
     clearance = CLEARANCE * scene.lattice.spacing

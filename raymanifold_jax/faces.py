@@ -17,7 +17,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +24,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .lattice import Lattice
+from .programs import program
 from .shapes import Shape, dot, greatest, least
 
 #: Voxels: centres this near to a surface may have it in their voxel.
@@ -48,7 +48,7 @@ class DistanceField:
     """The signed distance of some shapes in voxels, and its gradient, at points in scene units."""
 
     def __init__(self, lattice: Lattice, shapes: Sequence[Shape]):
-        self.lattice, self.spacing = lattice, lattice.spacing
+        self.lattice, self.spacing = lattice, np.float64(lattice.spacing)  # to programs, one of their numbers
         self._shapes = tuple(shapes)
 
     def distance(self, points: np.ndarray) -> np.ndarray:
@@ -112,12 +112,12 @@ def _union(shapes: tuple, points: Array) -> Array:
     return least(tuple(shape.distance(points) for shape in shapes))
 
 
-@eqx.filter_jit
+@program
 def _least(shapes: tuple, points: Array) -> Array:
     return _union(shapes, points)
 
 
-@eqx.filter_jit
+@program
 def _slope(shapes: tuple, points: Array) -> tuple[Array, Array]:
     # One by one, so that XLA does not work each out anew wherever their least is asked for.
     parts = [lax.optimization_barrier(_slope_of(shape, points)) for shape in shapes]
@@ -133,7 +133,7 @@ def _slope_of(shape: Shape, points: Array) -> tuple[Array, list[Array]]:
     return found[0][0], [rate for _, rate in found]
 
 
-@eqx.filter_jit
+@program
 def _nearest(shapes: tuple, points: Array) -> Array:
     return jnp.argmin(jnp.stack([shape.distance(points) for shape in shapes]), 0)
 
@@ -208,7 +208,7 @@ def _group(voxel: np.ndarray, sample: np.ndarray, slope: np.ndarray, count: int)
     return normals, has_face
 
 
-@jax.jit
+@program
 def _samples(center: Array, spacing: float) -> Array:
     """Of each voxel, 4 x 4 x 4 points."""
     side = (np.arange(4) + 0.5) / 4 - 0.5
@@ -216,12 +216,12 @@ def _samples(center: Array, spacing: float) -> Array:
     return (center[:, None] + samples * spacing).reshape(-1, 3)
 
 
-@jax.jit
+@program
 def _projected(points: Array, value: Array, slope: Array) -> Array:
     return points - value[:, None] * slope
 
 
-@jax.jit
+@program
 def _is_near(center: Array, points: Array, value: Array, spacing: float) -> Array:
     """Whether projected samples are on the surface, and in their voxels or nearly so."""
     apart = jnp.abs(points.reshape(len(center), -1, 3) - center[:, None]) / spacing
@@ -299,7 +299,7 @@ def _plane_offset(field: DistanceField, center: np.ndarray, normal: np.ndarray) 
     return offset
 
 
-@jax.jit
+@program
 def _along_normals(center: Array, normal: Array, spacing: float) -> Array:
     """Points on lines along the normals through several points of each voxel: some meet a face that is off-centre."""
     side = np.array([-0.375, -0.125, 0.125, 0.375])
@@ -392,13 +392,13 @@ class _Readings:
 # Steps of `_patches`, which have the points of each plane's patch in a row.
 
 
-@jax.jit
+@program
 def _on_planes(center: Array, normal: Array, offset: Array, spacing: float) -> tuple[Array, Array, Array]:
     patch, weight = patch_points(normal, offset, xp=jnp)
     return center[:, None] + patch * spacing, patch, weight
 
 
-@jax.jit
+@program
 def _refitted(normal, offset, creased, patch: Array, weight: Array, value: Array, slope: Array):
     """Planes moved so that over their patches in the voxel the signed distance averages 0 and its slope is theirs."""
     value = jnp.where(weight > 0, value, 0.0)
@@ -413,7 +413,7 @@ def _refitted(normal, offset, creased, patch: Array, weight: Array, value: Array
     return jnp.where(usable[:, None], refitted, normal), jnp.where(usable, through, offset)
 
 
-@jax.jit
+@program
 def _measured(normal, creased, patch: Array, weight: Array, value: Array, slope: Array) -> tuple[Array, ...]:
     """How much of the planes in the voxel is surface, and is there of them; its middle; and whether the surface is curved."""
     error = jnp.where(weight > 0, value, 0.0)
@@ -429,7 +429,7 @@ def _mean(vectors: Array, share: Array) -> Array:
     return jnp.stack([(vectors[..., axis] * share).sum(1) for axis in range(3)], -1)
 
 
-@jax.jit
+@program
 def _moved(center, patch: Array, value: Array, slope: Array, spacing: float) -> tuple[Array, Array]:
     """Points on planes moved to the surface along their grid's axis."""
     grid = _grid_axes(patch)
@@ -444,7 +444,7 @@ def _grid_axes(patch: Array) -> np.ndarray:
     return np.repeat(np.eye(3), patch.shape[1] // 3, axis=0)
 
 
-@jax.jit
+@program
 def _curved_area(normal, patch: Array, value: Array, slope: Array) -> Array:
     """The area of curved surfaces in their voxels, from points on planes near them that were `_moved` to them.
 

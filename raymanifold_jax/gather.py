@@ -30,6 +30,7 @@ from .emitters import emitter_light, point_light, small_emitters
 from .interpolation import ElementTable, element_table, interpolate_irradiance, slopes
 from .keep import keep
 from .march import fill, interpolate, march_between, transmittance_between
+from .programs import program
 from .scene import MIRROR, OPEN, SIDES, PointLight, Scene, Solid, Sun, Wall
 from .solution import Solution
 from .texture import Texture, value_at
@@ -216,17 +217,27 @@ def _light_field(solution: Solution) -> LightField:
     spread = lambda o, name: xp.broadcast_to(xp.asarray(0.0 if o is None else getattr(o, name), real), (bands,))
     diffuse = fill(solution.diffuse_fluence, solution.free)
     table = keep((solution.elements,), "element table", lambda: element_table(scene, solution.elements))
-    values = solution.diffuse_irradiance.T if len(solution.elements) else jnp.zeros((1, bands), real)
+    values = _transposed(solution.diffuse_irradiance) if len(solution.elements) else jnp.zeros((1, bands), real)
     return LightField(
         scene=scene,
         diffuse=diffuse,
-        fluence=diffuse + fill(solution.sun_fluence, solution.free),
+        fluence=_sum(diffuse, fill(solution.sun_fluence, solution.free)),
         table=table,
         irradiance=values,
         slope=slopes(scene, table, values),
         albedo=as_jax(xp.stack([spread(None if o is None or isinstance(o.albedo, Texture) else o, "albedo") for o in owners])),
         emission=as_jax(xp.stack([spread(o, "emission") for o in owners])),
     )
+
+
+@program
+def _transposed(values: Array) -> Array:
+    return values.T
+
+
+@program
+def _sum(one: Array, other: Array) -> Array:
+    return one + other
 
 
 def surface_radiance(field: LightField, hit: Hit) -> Float[Array, "n C"]:

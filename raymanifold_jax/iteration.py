@@ -25,10 +25,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .acceleration import Diffusion
+from .arrays import ones_like, zeros_like
 from .checkpoint import Checkpoint
 from .direct import Direct
 from .krylov import combine, linear_solve
 from .operator import Light, Materials, Transport
+from .programs import program
 from .progress import Progress
 
 _PLAIN = 0.9  # up to this albedo w = 1 will do
@@ -70,8 +72,8 @@ class System(eqx.Module):
 
     def nothing(self) -> Light:
         """No arriving light."""
-        voxels = jnp.zeros_like(self.source.voxels) if self.scatters and self.source.voxels is not None else None
-        return Light(jnp.zeros_like(self.source.elements), voxels)
+        source = self.source
+        return zeros_like(Light(source.elements, source.voxels if self.scatters else None))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +92,7 @@ class Certificate:
 
 def certify(system: System) -> Certificate:
     """Find a w: 1 where albedos are moderate, else by solving (I - K) w = 1 to within a half."""
-    albedo = system.materials.reflected(jax.tree.map(jnp.ones_like, system.source))
+    albedo = system.materials.reflected(ones_like(system.source))
     largest = float(albedo.largest())
     if largest == 0:
         return Certificate(0.0, 0)
@@ -116,17 +118,17 @@ def certify(system: System) -> Certificate:
     )
 
 
-@jax.jit
+@program
 def _where_any(light: Light) -> Light:
     return jax.tree.map(lambda a: jnp.where(a > 0, 1.0, 0.0).astype(a.dtype), light)
 
 
-@jax.jit
+@program
 def _differences(one: Light, other: Light) -> Light:
     return jax.tree.map(jnp.subtract, one, other)
 
 
-@eqx.filter_jit
+@program
 def _most_positive(light: Light):
     return jnp.stack([jnp.max(part, initial=0.0) for part in jax.tree.leaves(light)]).max()
 
@@ -146,7 +148,7 @@ def _by_powers(system: System, total: Light) -> Certificate:
     return Certificate(float(total.largest()) / (1 - left) - 1, count, "", total, slack)
 
 
-@eqx.filter_jit
+@program
 def _bounded(weights: Light, slack: Light, residual: Light, u: Light, passed: Light):
     """The largest of a u + t w - |r|, with t as the module's docstring says, and a as serves best; `passed` is K u."""
     size = jax.tree.map(jnp.abs, residual)
@@ -170,7 +172,7 @@ class Iteration:
         self.residual = system.materials.reflected(system.source)
         self.residuals = [float(self.residual.largest())]
         # What sources send out straight away is part of the scale; it is all there is where nothing is reflected.
-        self._scale = max(self.residuals[0], float(jnp.max(system.materials.emission, initial=0.0)))
+        self._scale = max(self.residuals[0], float(_brightest(system.materials)))
         self.target = rtol * self._scale
         self._rtol, self._most, self._meter = rtol, most, meter
         self.lost = self.arriving  # the low bits of Jacobi's sum
@@ -249,7 +251,7 @@ class Iteration:
     def _look_closer(self) -> None:
         weights, slack = self.certificate.weights, self.certificate.slack
         assert weights is not None and slack is not None
-        u = self.system.precondition(jax.tree.map(jnp.abs, self.residual))
+        u = self.system.precondition(_sizes(self.residual))
         tight = float(_bounded(weights, slack, self.residual, u, self.system.bounce(u)[1]))
         self.spend(1)
         self._tight = tight if math.isfinite(tight) else math.inf
@@ -322,6 +324,16 @@ class Iteration:
         self.note(float(residual.largest()), float(_largest(self.system, arriving)))
 
 
-@eqx.filter_jit
+@program
+def _sizes(light: Light) -> Light:
+    return jax.tree.map(jnp.abs, light)
+
+
+@program
+def _brightest(stuff: Materials):
+    return jnp.max(stuff.emission, initial=0.0)
+
+
+@program
 def _largest(system: System, arriving: Light):
     return system.materials.reflected(system.source + arriving).largest()

@@ -14,13 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .arrays import zeros_like
 from .operator import Light
+from .programs import program
 
 _INDEPENDENT = 1e-6  # of the first residual: less than this of a new direction is rounding
 
@@ -35,7 +36,7 @@ class Subspace:
     def __init__(self, apply: Callable[[Light], tuple[Light, Light]], start: Light, size: int, precondition: Callable):
         self._apply, self._precondition = apply, precondition
         self._length = float(norm(start))
-        empty = jax.tree.map(jnp.zeros_like, start)
+        empty = zeros_like(start)
         self._basis = [combine([1 / self._length], [start])] + [empty] * size
         self._kept: list[Light] = []
         self._steps = 0
@@ -48,7 +49,7 @@ class Subspace:
         sent = self._precondition(self._basis[k])
         kept, passed = self._apply(sent)
         if not self._kept:  # always as many, so that one program adds them up
-            self._kept = [jax.tree.map(jnp.zeros_like, kept)] * size
+            self._kept = [zeros_like(kept)] * size
         self._kept[k] = kept
         self._steps += 1
         self._basis[k + 1], column = _arnoldi(tuple(self._basis), sent, passed)
@@ -84,7 +85,7 @@ def linear_solve(
     """
     target = 1e-5 * float(norm(right))
     good = (lambda residual: float(norm(residual)) <= target) if good is None else good
-    solution, residual, count = jax.tree.map(jnp.zeros_like, right), right, 0
+    solution, residual, count = zeros_like(right), right, 0
     while count < most and not good(residual):
         space = Subspace(lambda sent: (sent, apply(sent)), residual, restart, precondition)
         while True:
@@ -96,7 +97,7 @@ def linear_solve(
     return solution, residual, count
 
 
-@eqx.filter_jit
+@program
 def _arnoldi(basis: tuple[Light, ...], sent: Light, passed: Light) -> tuple[Light, Array]:
     """The next basis vector: (I - K) sent, made orthogonal to the basis; `passed` is K sent. Unused vectors are 0."""
     vector = jax.tree.map(jnp.subtract, sent, passed)
@@ -115,7 +116,7 @@ def dot(a: Light, b: Light) -> Array:
     return sum(jax.tree.leaves(jax.tree.map(lambda x, y: jnp.sum(x * y), a, b)), start=jnp.zeros((), a.elements.dtype))
 
 
-@eqx.filter_jit
+@program
 def norm(light: Light) -> Array:
     """The 2-norm, with squares that neither overflow nor vanish."""
     scale = jnp.maximum(light.largest(), jnp.finfo(light.elements.dtype).tiny)
@@ -123,7 +124,7 @@ def norm(light: Light) -> Array:
     return scale * jnp.sqrt(dot(scaled, scaled))
 
 
-@eqx.filter_jit
+@program
 def _sum(weights: tuple[Array, ...], fields: tuple[Light, ...]) -> Light:
     total = jax.tree.map(lambda x: weights[0] * x, fields[0])
     for weight, field in zip(weights[1:], fields[1:], strict=True):
@@ -134,4 +135,4 @@ def _sum(weights: tuple[Array, ...], fields: tuple[Light, ...]) -> Light:
 def combine(weights, fields: list[Light]) -> Light:
     """The sum of `fields`, each times its weight."""
     real = fields[0].elements.dtype
-    return _sum(tuple(jnp.asarray(w, real) for w in weights), tuple(fields))
+    return _sum(tuple(np.asarray(w, real) for w in weights), tuple(fields))

@@ -23,6 +23,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from .adjoint import with_adjoint
+from .programs import program
 from .scene import Scene
 from .unfolding import Axis, box_span, in_blocks, sloped, to_voxel, unfolded_axes
 
@@ -57,12 +58,12 @@ def march(
 
 def fill(field: Float[Array, "C nx ny nz"], free: Float[Array, "nx ny nz"]) -> Float[Array, "C nx ny nz"]:
     """`field` with values where `free` is 0: means over the neighbours that have one, two voxels deep."""
-    field, free = jnp.asarray(field), jnp.asarray(free)
-    return _fill(field, (free > 0).astype(field.dtype))
+    return _fill(jnp.asarray(field), jnp.asarray(free))
 
 
-@jax.jit
-def _fill(field: Array, known: Array) -> Array:
+@program
+def _fill(field: Array, free: Array) -> Array:
+    known = (free > 0).astype(field.dtype)
     for _ in range(2):
         total, count = field * known, known
         for axis in (-3, -2, -1):

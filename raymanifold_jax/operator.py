@@ -16,6 +16,7 @@ from __future__ import annotations
 import dataclasses
 from contextlib import nullcontext
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -25,11 +26,12 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from . import checks
-from .arrays import as_jax, numpy_or_jax, real_dtype, worked_out_now
+from .arrays import as_jax, numpy_or_jax, ones_like, real_dtype, worked_out_now
 from .lattice import Lattice
 from .layout import Layout, Ordinates, make_ordinates
 from .partition import Partition
 from .placement import stored
+from .programs import program
 from .quadrature import Quadrature
 from .scene import Scene, Wall
 from .surfaces import Surfaces, patch_points
@@ -65,7 +67,7 @@ class Light(eqx.Module):
         return _largest(self)
 
 
-@eqx.filter_jit
+@program
 def _sum(one: Light, other: Light) -> Light:
     voxels = other.voxels if one.voxels is None else one.voxels
     if one.voxels is not None and other.voxels is not None:
@@ -73,7 +75,7 @@ def _sum(one: Light, other: Light) -> Light:
     return Light(one.elements + other.elements, voxels)
 
 
-@eqx.filter_jit
+@program
 def _largest(light: Light) -> Float[Array, ""]:
     parts = [light.elements] if light.voxels is None else [light.elements, light.voxels]
     return jnp.stack([jnp.max(jnp.abs(p), initial=0.0) for p in parts]).max()
@@ -96,8 +98,8 @@ class Materials(eqx.Module):
         return _times(by, Light(arriving.elements, arriving.voxels if scatters else None))
 
 
-@jax.jit
-def _times(one: Light, other: Light) -> Light:
+@program
+def _times(one: Any, other: Any) -> Any:
     return jax.tree.map(jnp.multiply, one, other)
 
 
@@ -182,7 +184,7 @@ class Transport(eqx.Module):
         return _balanced(self.factors, sent, None)[0]
 
 
-@eqx.filter_jit
+@program
 def _balanced(factors: Light | None, leaving: Light, inflow: Inflow | None) -> tuple[Light, Inflow | None]:
     if factors is None:
         return leaving, inflow
@@ -191,7 +193,7 @@ def _balanced(factors: Light | None, leaving: Light, inflow: Inflow | None) -> t
     return leaving, None if inflow is None else Inflow(inflow.radiance, factors.elements)
 
 
-@eqx.filter_jit
+@program
 def _means(sums: Light, furnace: Light) -> Light:
     elements = _ratio(sums.elements, furnace.elements)
     return Light(elements, None if sums.voxels is None else _ratio(sums.voxels, furnace.voxels))
@@ -209,10 +211,11 @@ def _balance(transport: Transport, area: Float[Array, " E"]) -> Transport:
     power, sums = _powers(transport, area), Light(transport.element_sums)
     if extinction is not None:
         sums = Light(sums.elements, transport.voxel_sums)
-    factors = jax.tree.map(jnp.ones_like, power)
+    factors = ones_like(power)
     for beyond in _ROUNDS_IN_VACUUM if extinction is None else _ROUNDS_IN_MEDIUM:
         sent = _transposed(transport, jax.tree.map(_ratio, power, sums))
-        factors = jax.tree.map(partial(_factor, beyond), factors, power, sent)
+        step = as_jax(beyond, factors.elements.dtype)
+        factors = jax.tree.map(partial(_factor, step), factors, power, sent)
         if transport.links is not None:
             sums = Light(transport.links.arriving(factors.elements))
         else:
@@ -222,7 +225,7 @@ def _balance(transport: Transport, area: Float[Array, " E"]) -> Transport:
     return dataclasses.replace(transport, element_sums=sums.elements, voxel_sums=sums.voxels, factors=factors)
 
 
-@eqx.filter_jit
+@program
 def _powers(transport: Transport, area: Float[Array, " E"]) -> Light:
     """At elements and in voxels, for a mean radiance of 1."""
     layout, images = transport.layout, len(transport.layout.unfolding.images())
@@ -234,8 +237,8 @@ def _powers(transport: Transport, area: Float[Array, " E"]) -> Light:
     return Light(power, layout.from_padded(transport.extinction) / images * volume)
 
 
-@jax.jit
-def _factor(beyond: float, factor: Array, wanted: Array, sent: Array) -> Array:
+@program
+def _factor(beyond: Array, factor: Array, wanted: Array, sent: Array) -> Array:
     better = jnp.clip(jnp.where(sent > 0, wanted / jnp.where(sent > 0, sent, 1.0), 1.0), 0.5, 2.0)
     return factor * (better / factor) ** beyond
 
@@ -251,7 +254,7 @@ def _transposed(transport: Transport, asked: Light, albedo=None) -> Light:
     return Light(exitance, source)
 
 
-@jax.jit
+@program
 def _ratio(sums: Array, furnace: Array) -> Array:
     return jnp.where(furnace > 0, sums / jnp.where(furnace > 0, furnace, 1.0), 0.0)
 
@@ -266,12 +269,12 @@ def _sweep(transport: Transport, leaving: Light, inflow: Inflow | None, fluence:
     return Light(*swept(*known, leaving.elements, leaving.voxels, slopes, inflow))
 
 
-@eqx.filter_jit
+@program
 def _slopes(layout: Layout | Partition, source, albedo, extinction) -> tuple[Array, ...]:
     return slopes_over(layout, source, albedo, extinction)
 
 
-@eqx.filter_jit
+@program
 def _unsloped(layout: Layout | Partition, slopes: tuple[Array, ...], albedo, extinction) -> Array:
     """The transpose of `_slopes` in the source."""
     return jax.vjp(lambda source: _slopes(layout, source, albedo, extinction), jnp.zeros_like(albedo))[1](slopes)[0]
@@ -287,13 +290,23 @@ def _furnace(transport: Transport, leaving: Light) -> Light:
     return Light(sums.elements, _outside(transport.layout, sums.voxels))
 
 
-@eqx.filter_jit
+@program
 def _outside(layout: Layout | Partition, voxels: Array) -> Array:
     solid = layout.from_padded(layout.buried[None].astype(layout.plane.dtype))[0] > 0
     return jnp.where(solid, 0.0, voxels)
 
 
-@jax.jit
+@program
+def _padded(layout: Layout | Partition, field: Array) -> Array:
+    return layout.to_padded(field)
+
+
+@program
+def _first(field: Array) -> Array:
+    return field[0]
+
+
+@program
 def _greatest(extinction: Array) -> Array:
     return lax.stop_gradient(jnp.max(extinction))
 
@@ -328,7 +341,7 @@ def _make_transport(
         quadrature = quadrature.mirrored(layout.unfolding.axes)
     with worked_out_now():
         ordinates = mark_over(layout, make_ordinates(quadrature, bands, plane_size(layout), layout.wide))
-    padded = None if extinction is None else layout.to_padded(extinction)
+    padded = None if extinction is None else _padded(layout, extinction)
     thickest = None
     if extinction is not None:
         thickest = _greatest(extinction)
@@ -348,13 +361,14 @@ def _make_transport(
     leaving = Light(ones(layout.elements), None if extinction is None else ones(*layout.shape))
     sums = _furnace(transport, stored(layout, leaving))
     assert sums.voxels is not None
-    fields = {"element_sums": sums.elements, "voxel_sums": sums.voxels, "coverage": sums.voxels[0]}
+    fields = {"element_sums": sums.elements, "voxel_sums": sums.voxels, "coverage": _first(sums.voxels)}
     transport = dataclasses.replace(transport, **fields)
     if area is not None and extinction is None and isinstance(layout, Layout) and worth_linking(layout, len(quadrature)):
         transport = dataclasses.replace(transport, links=find_links(layout, ordinates))
     if area is not None:
         transport = _balance(transport, as_jax(area, layout.plane.dtype))
     if thick and albedo is not None:
-        factor = 1.0 if transport.factors is None or transport.factors.voxels is None else transport.factors.voxels
-        transport = dataclasses.replace(transport, albedo=albedo * factor, thin=False)
+        if transport.factors is not None and transport.factors.voxels is not None:
+            albedo = _times(albedo, transport.factors.voxels)
+        transport = dataclasses.replace(transport, albedo=albedo, thin=False)
     return transport

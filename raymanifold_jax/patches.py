@@ -16,18 +16,17 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
-from scipy.spatial import KDTree
 
 from . import checks
 from .arrays import stop_gradient, worked_out_now
 from .directions import frames
 from .emitters import CLEARANCE, SMALL, EmittingFaces, emitting_faces, share_that_emits
 from .march import transmittance_unfolded
+from .programs import program
 from .scene import OPEN, Scene, Wall
 from .surfaces import Surfaces, patch_points
 from .trace import patch_visible
@@ -238,6 +237,8 @@ def _arriving(
 
 def _receivers(scene: Scene, patches: _Patches, surfaces: Surfaces, rows: np.ndarray) -> tuple[np.ndarray, ...]:
     """Points for the elements: which one's, where (in voxels), and its share. One each, more of those next to emitters."""
+    from scipy.spatial import KDTree  # 0.2 s, for scenes with emitters
+
     position = (surfaces.position[rows] - scene.lattice.lower) / scene.lattice.spacing
     ends = patches.center[patches.count == 0]
     distance, nearest = (np.asarray(found) for found in KDTree(ends).query(position, distance_upper_bound=_NEXT))
@@ -336,7 +337,7 @@ def _light(scene: Scene, patches: _Patches, pairs: _Pairs, start: np.ndarray, ra
     return _summed(geometry.astype(radiance.dtype), element, patches.owner[patch], passed, radiance, len(start))
 
 
-@eqx.filter_jit
+@program
 def _summed(geometry: Any, element: Any, owner: Any, passed: Array | None, radiance: Array, count: int) -> Array:
     sent = geometry * radiance[:, owner]
     sent = sent if passed is None else sent * passed.T

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from .programs import program
 from .scene import Scene
 from .surfaces import Surfaces
 
@@ -55,7 +56,7 @@ class Energy(NamedTuple):
         return _imbalance(*self)
 
 
-@jax.jit
+@program
 def _imbalance(emitted, entering, *taken) -> Float[jax.Array, ""]:
     put_in = emitted + entering
     return (put_in - sum(taken)) / jnp.where(put_in > 0, put_in, 1.0)

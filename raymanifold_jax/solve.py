@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from . import checks
 from .acceleration import make_diffusion
-from .arrays import as_jax, numpy_or_jax, real_dtype, stop_gradient, worked_out_now
+from .arrays import as_jax, numpy_or_jax, real_dtype, stop_gradient, worked_out_now, zeros_like
 from .checkpoint import Checkpoint
 from .direct import first_flight, sky_radiance
 from .implicit import Unwatched, attach
@@ -33,6 +33,7 @@ from .operator import Light, Materials, Transport, make_transport, materials
 from .optimistix_solver import OptimistixFixedPoint
 from .placement import check_agreement, restored, stored
 from .prepare import Prepared, prepare
+from .programs import program
 from .progress import Progress, make_progress
 from .quadrature import Quadrature, for_scene
 from .scene import OPEN, PointLight, Scene, Sky, Sun, Wall
@@ -241,7 +242,7 @@ def _depth(stuff: Materials, spacing: float) -> float:
     return float(_longest(stuff.extinction)) * spacing
 
 
-@jax.jit
+@program
 def _longest(extinction: Float[Array, "C nx ny nz"]) -> Float[Array, ""]:
     return jnp.stack([jnp.max(jnp.sum(extinction, axis)) for axis in (1, 2, 3)]).max()
 
@@ -323,7 +324,7 @@ def _finish(
     bounced = _not_negative(bounced)
     if not system.scatters:  # the iteration did not need the light in the voxels
         before = iteration.before if isinstance(iteration, Iteration) and iteration.asked else bounced
-        everywhere = jax.tree.map(jnp.zeros_like, system.source)
+        everywhere = zeros_like(system.source)
         if before is not None:
             everywhere = system.transport(system.materials.reflected(system.source + before), fluence=True)
         bounced = Light(bounced.elements, everywhere.voxels)
@@ -348,24 +349,24 @@ def _finish(
     )  # fmt: skip
 
 
-@jax.jit
+@program
 def _not_negative(light: Light) -> Light:
     return jax.tree.map(lambda x: x + lax.stop_gradient(jnp.maximum(-x, 0.0)), light)
 
 
-@eqx.filter_jit
+@program
 def _covered(transport: Transport) -> Float[Array, "nx ny nz"]:
     """The share of each voxel that is free: of the sum of weights that a wholly free one gets."""
     weights = jnp.stack([jnp.sum(o.weight) for o in transport.ordinates])
     return transport.coverage / (weights.sum() * len(transport.layout.unfolding.images()))
 
 
-@jax.jit
+@program
 def _where(outside: Bool[Array, "nx ny nz"], values: Float[Array, "..."]) -> Float[Array, "nx ny nz"]:
     return jnp.where(outside, values, 0.0)
 
 
-@jax.jit
+@program
 def _fields(rest: Light, sun: Light, outside: Bool[Array, "nx ny nz"]) -> dict[str, Array]:
     fluence = lambda light: jnp.where(outside, 4 * jnp.pi * light.voxels, 0.0)
     return {
@@ -382,7 +383,7 @@ def _energy(scene: Scene, surfaces: Surfaces, quadrature, stuff: Materials, free
     return _account(stuff, free, fields, points, entering, area, as_jax(surfaces.open), np.asarray(scene.lattice.spacing))
 
 
-@eqx.filter_jit
+@program
 def _account(stuff: Materials, free, fields, points, entering, area, is_open, spacing) -> Energy:
     real, bands = free.dtype, len(stuff.albedo)
     irradiance = fields["diffuse_irradiance"] + fields["sun_irradiance"]

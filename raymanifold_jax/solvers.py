@@ -19,9 +19,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .arrays import ones_like
 from .iteration import Iteration, System
 from .krylov import Subspace, combine, dot, norm
 from .operator import Light
+from .programs import program
 
 _FEW_BOUNCES = 0.1  # up to this albedo nothing beats adding up orders
 _MANY_BOUNCES = 0.7  # from here on diffusion pays for its making
@@ -56,7 +58,7 @@ class Orders(eqx.Module):
             iteration.reach(iteration.arriving + order, residual)
 
 
-@eqx.filter_jit
+@program
 def _add(total: Light, lost: Light, order: Light) -> tuple[Light, Light]:
     """Kahan's sum: `lost` holds the low bits."""
     addend = jax.tree.map(jnp.subtract, order, lost)
@@ -131,7 +133,7 @@ def _mixing(changes: list[Light], residual: Light) -> np.ndarray:
 
 
 def _largest_albedo(system: System) -> float:
-    return float(system.materials.reflected(jax.tree.map(jnp.ones_like, system.source)).largest())
+    return float(system.materials.reflected(ones_like(system.source)).largest())
 
 
 def automatic(system: System, depth: float) -> Jacobi | Krylov:

@@ -12,11 +12,13 @@ For this package: `Axis`, `unfolded_axes`, `mirror_images`, `fold`, `to_voxel`, 
 
 from __future__ import annotations
 
+import functools
 import math
+import os
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,6 +27,7 @@ from jaxtyping import Array, Float
 
 from . import checks
 from .arrays import real_dtype
+from .programs import program
 from .scene import MIRROR, PERIODIC, Scene
 
 _BLOCK = 1 << 14  # rays a call
@@ -139,16 +142,39 @@ def in_blocks(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
     block = min(_BLOCK, max(64, 1 << (max(count, 1) - 1).bit_length()))
     arrays = tuple(_padded(np.asarray(a, real), block, np) for a in arrays)
     call = _jitted_again if checks.is_traced(scene) else _jitted
-    parts = [call(function, scene, tuple(a[i : i + block] for a in arrays)) for i in range(0, len(arrays[0]), block)]
+    blocks = [tuple(a[i : i + block] for a in arrays) for i in range(0, len(arrays[0]), block)]
+    run = lambda rays: call(function, scene, rays)
+    if len(blocks) > 2 and not checks.is_traced(scene) and jax.default_backend() == "cpu":
+        # XLA works on what one thread asks for in turn. The first block alone, for the program to be compiled once.
+        here = functools.partial(_as_here, real == np.float64, jax.config.jax_default_device, run)  # pyright: ignore[reportAttributeAccessIssue]
+        parts = [run(blocks[0]), *_pool().map(here, blocks[1:])]
+    else:
+        parts = [*map(run, blocks)]
+    return parts[0] if len(arrays[0]) == count == block else _joined(tuple(parts), count)
+
+
+def _as_here(x64: bool, device: Any, run: Callable, rays: tuple[np.ndarray, ...]) -> Any:
+    # Contexts hold for one thread only.
+    with jax.enable_x64(x64), jax.default_device(device):
+        return jax.block_until_ready(run(rays))
+
+
+@functools.cache
+def _pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(os.cpu_count(), "rays")
+
+
+@program
+def _joined(parts: tuple, count: int) -> Any:
     return jax.tree.map(lambda *r: jnp.concatenate(r)[:count], *parts)
 
 
-@eqx.filter_jit
+@program
 def _jitted(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
     return _in_bundles(function, scene, arrays)
 
 
-@eqx.filter_jit
+@program
 def _jitted_again(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
     """The same for derivatives: what rays meet is worked out again backwards, not kept."""
     return _in_bundles(jax.checkpoint(function), scene, arrays)  # pyright: ignore[reportPrivateImportUsage]

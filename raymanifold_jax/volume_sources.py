@@ -24,16 +24,17 @@ import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
-from scipy import ndimage
 
 from . import checks
 from .arrays import real_dtype
 from .directions import gathering
 from .march import march_between
+from .programs import program
 from .scene import Scene
 from .surfaces import Surfaces
 from .trace import share_that_passes, trace_rays
@@ -85,6 +86,8 @@ def compact_sources(scene: Scene, surfaces: Surfaces, blocks: int = 1) -> Volume
     emission = np.where(surfaces.solid, 0.0, np.asarray(known, np.float64))
     if not emission.any():
         return None
+    from scipy import ndimage  # which takes its time
+
     at_solids = np.zeros(scene.lattice.shape, bool)
     at_solids[tuple(surfaces.voxel[surfaces.side < 0].T)] = True
     label = np.zeros(scene.lattice.shape, np.int32)
@@ -198,7 +201,7 @@ def _from_points(scene: Scene, part: Part, u: np.ndarray, normal: np.ndarray | N
     return jnp.concatenate(found, -1) if found else jnp.zeros((scene.bands, 0))
 
 
-@eqx.filter_jit
+@program
 def _summed(passed: Array, geometry: Array, power: Numbers) -> Array:
     return jnp.einsum("nmc,nm,cm->cn", passed, geometry, jnp.asarray(power, passed.dtype))
 
@@ -224,7 +227,9 @@ def _collected(scene: Scene, u: Array, direction: Array) -> Float[Array, "n C"]:
 def emission_of(scene: Scene) -> Float[Array, "C nx ny nz"]:
     """The medium's emission in each voxel."""
     assert scene.medium is not None
-    return jnp.moveaxis(jnp.broadcast_to(scene.medium.coefficients()[2], (*scene.lattice.shape, scene.bands)), -1, 0)
+    xp = _numpy(scene.medium)
+    emission = jax.tree.map(xp.asarray, scene.medium).coefficients()[2]
+    return xp.moveaxis(xp.broadcast_to(emission, (*scene.lattice.shape, scene.bands)), -1, 0)
 
 
 def with_emission(scene: Scene, emission: Numbers) -> Scene:

@@ -180,7 +180,7 @@ def test_on_the_command_line(tmp_path, monkeypatch):
 
     from raymanifold_jax import cli
 
-    monkeypatch.setattr(cli, "_use_cache", lambda: None)
+    monkeypatch.setattr(cli, "_use_cache", lambda task="": None)
     options = ["--size", "4", "--directions", "24", "--quiet"]
     run = lambda *more: CliRunner().invoke(cli.main, ["solve", "room", *options, *map(str, more)])
     state, kept = tmp_path / "run.npz", tmp_path / "solution.npz"

@@ -67,7 +67,7 @@ def library(monkeypatch, tmp_path) -> Library:
     fake = Library()
     monkeypatch.setitem(vars(rm), "solve", fake.solve)
     monkeypatch.setitem(vars(rm), "render", fake.render)
-    monkeypatch.setattr(cli, "_use_cache", lambda: None)
+    monkeypatch.setattr(cli, "_use_cache", lambda task="": None)
     monkeypatch.chdir(tmp_path)
     return fake
 

@@ -453,7 +453,7 @@ def test_textures_that_are_wrong(tmp_path, rows, line, message):
 @pytest.mark.slow
 def test_init_and_render(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(cli, "_use_cache", lambda: None)
+    monkeypatch.setattr(cli, "_use_cache", lambda task="": None)
     run = CliRunner()
     assert run.invoke(cli.main, ["init"]).exit_code == 0
     again = run.invoke(cli.main, ["init"])
