@@ -32,7 +32,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
-from scipy.ndimage import distance_transform_cdt
 
 from .arrays import as_jax
 from .layout import Layout
@@ -259,10 +258,15 @@ def make_diffusion(transport: Transport, surfaces: Surfaces, stuff: Materials) -
 
 def _distance(solid: np.ndarray, surfaces: Surfaces, shape: tuple[int, int, int]) -> np.ndarray:
     """From each voxel to the nearest surface, in voxels, along the axes (at least 1/2)."""
-    beside = np.zeros(shape, bool)
-    beside[tuple(np.clip(surfaces.probe, 0, np.array(shape) - 1).T)] = True
-    away = lambda there: distance_transform_cdt(~there, "taxicab") if there.any() else np.full(shape, sum(shape))
-    return np.maximum(np.minimum(away(solid), away(beside) + 0.5), 0.5)
+    distance = np.where(solid, 0.0, float(sum(shape)))
+    distance[tuple(np.clip(surfaces.probe, 0, np.array(shape) - 1).T)] = 0.5
+    for axis in range(3):
+        steps = np.arange(shape[axis]).reshape([-1 if a == axis else 1 for a in range(3)])
+        for flipped in (False, True):
+            turned = np.flip(distance, axis) if flipped else distance
+            turned = np.minimum.accumulate(turned - steps, axis) + steps
+            distance = np.flip(turned, axis) if flipped else turned
+    return np.maximum(distance, 0.5)
 
 
 @program
