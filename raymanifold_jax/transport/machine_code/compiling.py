@@ -22,7 +22,7 @@ except ImportError:  # Windows, where each process compiles
 _OPTIONS: Any = dict(fastmath={"contract", "nsz"}, error_model="numpy", _nrt=False, no_cfunc_wrapper=True)
 
 # Called by entries only. Numba would compile a way in from Python for each, which takes apart all the tuples.
-compiled: Any = numba.njit(no_cpython_wrapper=True, **_OPTIONS)
+compiled: Any = numba.njit(no_cpython_wrapper=True, **_OPTIONS)  # pyright: ignore[reportCallIssue]
 
 
 def entry(function: Callable) -> Any:
