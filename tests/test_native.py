@@ -44,6 +44,7 @@ def _box(medium: rm.Medium | None, boundary: rm.Boundary, shape: tuple[int, int,
 _ROOM = rm.Boundary(x=rm.Wall(0.5), y=rm.OPEN, z=(rm.Wall(0.7), rm.OPEN))
 _AROUND = rm.Boundary(x=rm.PERIODIC, y=rm.MIRROR, z=(rm.Wall(0.7), rm.OPEN))
 _TORUS = rm.Boundary(x=rm.OPEN, y=rm.PERIODIC, z=rm.PERIODIC)
+_TURNING = (_AROUND, "around an axis, mirrored"), (_TORUS, "around two axes")
 _SCENES = {
     "vacuum": lambda: _box(None, _ROOM),
     "vacuum around an axis, mirrored": lambda: _box(None, _AROUND, (5, 6, 9)),
@@ -96,7 +97,7 @@ def _close(found, expected, free: np.ndarray) -> None:
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * float(jnp.abs(b).max()))
 
 
-_QUICK = {"vacuum", "vacuum around two axes", "thin fog", "thick uneven fog in two bands", "around an axis, mirrored"}
+_QUICK = {"vacuum", "vacuum around two axes", "thin fog", "thick uneven fog in two bands"}
 _EACH = pytest.mark.parametrize("name", [n if n in _QUICK else pytest.param(n, marks=pytest.mark.slow) for n in _SCENES])
 
 
@@ -124,7 +125,7 @@ def test_transpose(name):
             _close(back(found[2]), back(expected[2]), case.free)
 
 
-@pytest.mark.parametrize("name", ["vacuum", "around an axis, mirrored"])
+@pytest.mark.parametrize("name", ["vacuum", pytest.param("around an axis, mirrored", marks=pytest.mark.slow)])
 def test_light_that_only_comes_in_is_swept_where_it_does(name):
     case = _Case(_SCENES[name]())
     towards = np.random.default_rng(4).uniform(size=case.inflow.radiance.shape[1]) < 0.5  # half of the sky is dark
@@ -146,7 +147,10 @@ def test_without_fluence():
     _close(elements, derivative._sweep_program(manner, *given)[0], case.free)
 
 
-@pytest.mark.parametrize("boundary", [_ROOM, _AROUND, _TORUS], ids=["room", "around an axis, mirrored", "around two axes"])
+@pytest.mark.parametrize(
+    "boundary",
+    [pytest.param(_ROOM, id="room"), *(pytest.param(b, id=i, marks=pytest.mark.slow) for b, i in _TURNING)],
+)
 def test_links(boundary, monkeypatch):
     case = _Case(_box(None, boundary))
     found = find_links(case.layout, case.transport.ordinates)
@@ -159,7 +163,9 @@ def test_links(boundary, monkeypatch):
         _close(by_xla(case.elements), right, case.free)
 
 
-@pytest.mark.parametrize("name", ["vacuum", "around an axis, mirrored", "around two axes"])
+@pytest.mark.parametrize(
+    "name", ["vacuum", "around an axis, mirrored", pytest.param("around two axes", marks=pytest.mark.slow)]
+)
 def test_marks(name, monkeypatch):
     layout = _Case(_SCENES[name]()).layout
     ordinates = make_ordinates(rm.quadrature.for_scene(_SCENES[name](), 40), 1, plane_size(layout))
