@@ -48,8 +48,18 @@ def test_a_ball_that_emits():
     assert abs(error.mean()) < 2e-3
 
 
-@pytest.mark.parametrize("medium", [None, rm.Medium(0.0, 0.7)], ids=["vacuum", "absorber"])
-@pytest.mark.parametrize("kind", ["lamp", "point"])
+_ABSORBER = rm.Medium(0.0, 0.7)
+
+
+@pytest.mark.parametrize(
+    ("kind", "medium"),
+    [
+        pytest.param("lamp", None, id="lamp-vacuum"),
+        pytest.param("point", _ABSORBER, id="point-absorber"),
+        pytest.param("lamp", _ABSORBER, id="lamp-absorber", marks=pytest.mark.slow),
+        pytest.param("point", None, id="point-vacuum", marks=pytest.mark.slow),
+    ],
+)
 def test_behind_a_mirror_is_the_same_again(kind, medium):
     n = 8
 
