@@ -9,16 +9,12 @@ C D: the bits that say which directions hit an element. Without a medium there a
 SWEEPS bytes and BUFFERS words a voxel more, and the links are twice as long on their way. The constants are for 32-bit numbers;
 with them the peaks of ring, three balls and the Cornell box at 32, 64 and 128 cubed, 1, 3 and 8 bands, come out within 14 %.
 
-Public names: `estimate_memory`, `available_memory`, `check_memory`, `gigabytes`, `release`.
+Public names: `estimate_memory`, `available_memory`, `check_memory`, `gigabytes`.
 """
 
-import ctypes
-import functools
 import importlib.util
 import os
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 PROGRAM = 540_000_000  # Python, JAX, compilation
 SWEEPS = 150_000_000  # compilation of XLA's sweeps
@@ -78,19 +74,6 @@ def check_memory(scene_shape: Shape, bands: int, directions: int, medium: bool, 
     advice = f"{low} voxels on the longest side would fit" if low else "free some memory, or use a larger machine"
     got = f"{' x '.join(map(str, scene_shape))} voxels, which need about {gigabytes(need)}"
     raise ValueError(f"size: got {got}, expected at most the {gigabytes(available)} available; {advice}")
-
-
-def release() -> None:
-    """Give the system what has been freed: glibc keeps it, up to a quarter of a solve's peak. Takes some 10 ms."""
-    _trim()(0)
-
-
-@functools.cache
-def _trim() -> Callable[[int], Any]:
-    try:
-        return ctypes.CDLL(None).malloc_trim
-    except (AttributeError, OSError, TypeError):  # another C library
-        return lambda _: None
 
 
 def gigabytes(size: float) -> str:

@@ -19,7 +19,6 @@ from jax.sharding import Mesh
 from . import checks
 from .arrays import worked_out_now
 from .layout import Layout, make_layout
-from .memory import release
 from .partition import Partition, make_partition
 from .placement import known
 from .scene import Scene
@@ -58,7 +57,6 @@ class Prepared:
         same = len(now) == len(before) and all(map(np.array_equal, now, before))
         if kept is None or not same:
             kept = make()
-            release()
             if not checks.is_traced(kept):
                 self._kept[key] = now, kept, alive
         return kept
@@ -69,6 +67,4 @@ def prepare(scene: Scene) -> Prepared:
     # Known even while JAX traces values.
     with worked_out_now():
         surfaces = find_surfaces(scene)
-        prepared = Prepared(surfaces, make_layout(scene, surfaces))
-    release()
-    return prepared
+        return Prepared(surfaces, make_layout(scene, surfaces))

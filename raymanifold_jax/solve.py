@@ -28,7 +28,7 @@ from .checkpoint import Checkpoint
 from .direct import first_flight, sky_radiance
 from .implicit import Unwatched, attach
 from .iteration import Iteration, System, certify
-from .memory import check_memory, release
+from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
 from .optimistix_solver import OptimistixFixedPoint
 from .placement import check_agreement, restored, stored
@@ -206,7 +206,6 @@ def _iterate(
         def diffusion_and_certificate():
             fresh.append(True)
             near = make_diffusion(known.transport, surfaces, known.materials) if diffuse else None
-            release()
             return near, certify(known if near is None else dataclasses.replace(known, near=near))
 
         make = diffusion_and_certificate
