@@ -7,7 +7,7 @@ The need in bytes, with V voxels (a layer of ghosts included), C bands, E surfac
 C D: the bits that say which directions hit an element. Without a medium there are also links from element to element (see
 `transport.links`), LINKS E D, if these are not more than MOST_LINKS. Where sweeps are XLA's (see `transport.native`), there are
 SWEEPS bytes and BUFFERS words a voxel more, and the links are twice as long on their way. The constants are for 32-bit numbers;
-with them the peaks of ring, three balls and the Cornell box at 32, 64 and 128 cubed, 1, 3 and 8 bands, come out within 14 %.
+with them the peaks of ring, three balls and the Cornell box at 32, 64 and 128 cubed, 1, 3 and 8 bands, come out within 15 %.
 
 Public names: `estimate_memory`, `available_memory`, `check_memory`, `gigabytes`.
 """
