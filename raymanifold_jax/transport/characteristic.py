@@ -197,7 +197,8 @@ def _sweep_axis(
 
 def each_chunk(ordinates: Ordinates, add: Callable[[Ordinates, Any], Any], totals: Any, wide: bool) -> Any:
     """`add(chunk, totals)` one chunk of directions after the other; `wide`: two at a time, each of them to nothing."""
-    if not wide or ordinates.weight.shape[0] < 2:
+    count = ordinates.weight.shape[0]
+    if not wide or count < 2 or count % 2:
         return lax.fori_loop(0, ordinates.chunks, lambda number, totals: add(chunk_of(ordinates, number), totals), totals)
     axes = jax.tree.map(lambda a: 0 if a.ndim else None, ordinates)
     nothing = jax.tree.map(jnp.zeros_like, totals)
