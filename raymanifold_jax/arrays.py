@@ -49,7 +49,7 @@ def ones_like(tree: T) -> T:
 
 
 def _filled_like(array: Array, filled: Callable, like: Callable) -> Array:
-    if checks.is_traced(array) or len(array.devices()) > 1 or on_accelerator():
+    if checks.is_traced(array) or on_accelerator() or (isinstance(array, jax.Array) and len(array.devices()) > 1):
         return like(array)
     return jax.device_put(filled(array.shape, array.dtype))
 

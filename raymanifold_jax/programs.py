@@ -27,6 +27,7 @@ import platform
 import secrets
 import stat
 import sys
+import threading
 import types
 import zlib
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -52,14 +53,16 @@ _VERSIONED = (jax, jaxlib, eqx, np)
 _KNOWN = {__name__.partition(".")[0], *(package.__name__ for package in _VERSIONED), *sys.stdlib_module_names}
 _NAMELESS = pickle.PicklingError, TypeError, AttributeError  # what pickle raises for what has no name
 _FAST = 1  # of zlib's levels
+_MOST_LISTED = 300  # programs of a task: more than one start uses
 
 _folder: _Folder | None = None
+_finding = threading.RLock()  # held while a program is looked for or made: threads may ask for the same one
 
 
 def keep_in(directory: str | os.PathLike[str] | None, task: str = "") -> None:
     """Keep the programs of this process in a folder in this directory, or nowhere. The command line does.
 
-    What the last process with this `task` came to use is loaded ahead, beside what else there is to do.
+    What processes with this `task` came to use is loaded ahead, beside what else there is to do.
     """
     global _folder
     _folder = None
@@ -95,9 +98,10 @@ def program(function: Callable[..., R]) -> Callable[..., R]:
         if checks.is_traced(leaves):
             return compiling(*arguments, **named)
         key = tree, tuple(map(_kind, leaves)), real_dtype()
-        if key not in ready:
-            known = [_Array.like(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves]
-            ready[key] = _find(_folder, function, tree, known)
+        with _finding:
+            if key not in ready:
+                known = [_Array.like(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves]
+                ready[key] = _find(_folder, function, tree, known)
         run = ready[key]
         return compiling(*arguments, **named) if run is None else run([leaf for leaf in leaves if eqx.is_array(leaf)])
 
@@ -200,12 +204,17 @@ class _Folder:
         self.path = path
         self._list = path / f"task-{_digest(task.encode())}"
         names = self._list.read_text(errors="replace").split() if self._list.exists() else []
+        if len(names) > _MOST_LISTED:  # of what the task was before: begin anew
+            names = []
+            with suppress(OSError):
+                self._list.unlink()
         pool = ThreadPoolExecutor(1, "programs")
         self._coming = {name: pool.submit(_load, path / name) for name in dict.fromkeys(names)}
 
     def load(self, file: Path) -> tuple[Callable, bytes] | None:
-        if file.name in self._coming:
-            return self._coming.pop(file.name).result()
+        coming = self._coming.pop(file.name, None)
+        if coming is not None:
+            return coming.result()
         with suppress(OSError), self._list.open("a") as names:
             names.write(f"{file.name}\n")
         return _load(file)

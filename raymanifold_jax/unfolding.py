@@ -161,7 +161,8 @@ def _as_here(x64: bool, device: Any, run: Callable, rays: tuple[np.ndarray, ...]
 
 @functools.cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count(), "rays")
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return ThreadPoolExecutor(cores, "rays")
 
 
 @program

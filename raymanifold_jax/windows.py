@@ -40,19 +40,24 @@ def make_windows(counts: Sequence[Int[np.ndarray, " K"]], areas: Sequence[int]) 
     most = max(int(count.max(initial=0)) for count in counts)
     crowds = lambda size: [np.nonzero(count > size)[0] for count in counts]
 
-    def work(size: int) -> float:
+    def slots(size: int) -> int:
         crowded = max(map(len, crowds(size)))
-        # Two kinds of reads; and a crowded plane is crossed once more.
-        return (
-            np.inf if crowded > _MOST_CROWDED else 2 * size * max(map(len, counts)) + crowded * (2 * (most - size) + max(areas))
+        return crowded if crowded < 3 else 1 << (crowded - 1).bit_length()
+
+    def work(size: int) -> float:
+        planes = slots(size)
+        # Slots that an axis does not need are filled with a plane that has nothing left to read.
+        filled = all(
+            count.min() <= size or len(own) == planes for count, own in zip(counts, crowds(size), strict=True)
         )
+        if planes > _MOST_CROWDED or not filled:
+            return np.inf
+        # Two kinds of reads; and a crowded plane is crossed once more.
+        return 2 * size * max(map(len, counts)) + planes * (2 * (most - size) + max(areas))
 
     # Programs differ by these numbers: powers of 2, for few of them.
     size = min((1 << n for n in range(_LEAST.bit_length() - 1, max(most, _LEAST).bit_length() + 1)), key=work)
-    crowded = crowds(size)
-    planes = max(map(len, crowded))
-    planes = planes if planes < 3 else 1 << (planes - 1).bit_length()
-    windows = []
+    crowded, planes, windows = crowds(size), slots(size), []
     for count, own in zip(counts, crowded, strict=True):
         slot = np.full(len(count), planes)
         slot[own] = np.arange(len(own))

@@ -119,5 +119,11 @@ def test_windows_hold_all_rows_of_every_plane():
             there = rows > windows.size
             assert (slot[plane] < windows.count) == there
             assert not there or crowded[slot[plane]] == plane
+    # A lattice of one layer, all of it crowded, beside axes with two walls: no plane may be read twice.
+    layer = [np.array([192, *[64] * 192, 192])] * 2 + [np.array([768])]
+    for windows, count in zip(make_windows(layer, [194, 194, 194**2]), layer, strict=True):
+        crowded, slot = np.asarray(windows.crowded), np.asarray(windows.slot)
+        twice = [plane for number, plane in enumerate(crowded) if count[plane] > windows.size and slot[plane] != number]
+        assert not twice and windows.size + windows.rest >= count.max()
     (alone,) = make_windows([np.full(40, 640)], [1024])  # no plane has fewer: none is crowded
     assert alone.count == 0 and alone.size >= 640 and alone.rest == 0

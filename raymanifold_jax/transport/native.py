@@ -109,7 +109,7 @@ def sweep(
     sloped = slopes is not None
     at_elements = np.zeros((bands, layout.elements))
     in_voxels = np.zeros((bands, *layout.padded), real)
-    dark = not sent.any() and (volume is None or not volume.any())
+    dark = not sent.any() and not any(np.asarray(field).any() for field in (volume, *(slopes or ())) if field is not None)
 
     def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
         planes, cut, hits, probes = arguments

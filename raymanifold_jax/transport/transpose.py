@@ -301,4 +301,5 @@ def _axis_adjoint(track: Track, ordinates: Ordinates, reads: AxisReads, rows, wa
 
     planes = [jnp.zeros((track.count, bands, track.area), real)] * (kinds + has_factor)
     radiance = None if entry is None else jnp.zeros_like(entry.radiance)
-    return each_chunk(ordinates, chunk_step, (planes, radiance), track.wide)
+    # What is kept of a chunk is large: not of two at once.
+    return each_chunk(ordinates, chunk_step, (planes, radiance), track.wide and not whole)
