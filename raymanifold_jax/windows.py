@@ -47,9 +47,7 @@ def make_windows(counts: Sequence[Int[np.ndarray, " K"]], areas: Sequence[int]) 
     def work(size: int) -> float:
         planes = slots(size)
         # Slots that an axis does not need are filled with a plane that has nothing left to read.
-        filled = all(
-            count.min() <= size or len(own) == planes for count, own in zip(counts, crowds(size), strict=True)
-        )
+        filled = all(count.min() <= size or len(own) == planes for count, own in zip(counts, crowds(size), strict=True))
         if planes > _MOST_CROWDED or not filled:
             return np.inf
         # Two kinds of reads; and a crowded plane is crossed once more.

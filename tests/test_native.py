@@ -138,6 +138,14 @@ def test_light_that_only_comes_in_is_swept_where_it_does(name):
     _close(native.sweep(case.manner, *given), derivative._sweep_program(case.manner, *given), case.free)
 
 
+def test_slopes_alone_are_swept():
+    case = _Case(_SCENES["thick uneven fog in two bands"]())
+    given = *case.known, 0 * case.elements, 0 * case.voxels, case.slopes, None
+    found = native.sweep(case.manner, *given)
+    assert np.abs(found[0]).max() > 0
+    _close(found, derivative._sweep_program(case.manner, *given), case.free)
+
+
 def test_without_fluence():
     case = _Case(_SCENES["thick uneven fog in two bands"]())
     given = *case.known, case.elements, case.voxels, None, case.inflow

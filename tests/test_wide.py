@@ -24,9 +24,9 @@ def double() -> Iterator[None]:
         yield
 
 
-def _box(medium: rm.Medium | None, boundary: rm.Boundary, shape: tuple[int, int, int] = (9, 9, 9)) -> rm.Scene:
-    solids = [rm.Solid(rm.Sphere((0.5, 0.5, 0.45), 0.23), 0.8), rm.Solid(rm.Box((0.1, 0.1, 0), (0.3, 0.35, 0.3)), 0.5)]
-    return rm.Scene(rm.Lattice(shape, 1 / 9), solids, medium, lights=[rm.Sky(1.0)], boundary=boundary)
+def _box(medium: rm.Medium | None, boundary: rm.Boundary, shape: tuple[int, int, int] = (9, 9, 9), count: int = 1) -> rm.Scene:
+    solids = rm.Solid(rm.Sphere((0.5, 0.5, 0.45), 0.23), 0.8), rm.Solid(rm.Box((0.1, 0.1, 0), (0.3, 0.35, 0.3)), 0.5)
+    return rm.Scene(rm.Lattice(shape, 1 / 9), solids[:count], medium, lights=[rm.Sky(1.0)], boundary=boundary)
 
 
 def _uneven(shape: tuple[int, ...], strength: float) -> np.ndarray:
@@ -35,12 +35,13 @@ def _uneven(shape: tuple[int, ...], strength: float) -> np.ndarray:
 
 _ROOM = rm.Boundary(x=rm.Wall(0.5), y=rm.OPEN, z=(rm.Wall(0.7), rm.OPEN))
 _SCENES = {
-    "vacuum": lambda: _box(None, _ROOM),
+    "vacuum": lambda: _box(None, _ROOM, count=2),  # no plane is crowded
     "thick uneven fog in two bands": lambda: _box(rm.Medium(_uneven((9, 9, 9, 2), 12.0), absorption=0.3), _ROOM),
     "around an axis, mirrored": lambda: _box(
         rm.Medium(_uneven((5, 6, 9), 4.0), absorption=0.3),
         rm.Boundary(x=rm.PERIODIC, y=rm.MIRROR, z=(rm.Wall(0.7), rm.OPEN)),
         (5, 6, 9),
+        count=2,
     ),
 }
 
@@ -83,7 +84,7 @@ def test_wide_sweeps_give_the_same(name: str, monkeypatch: pytest.MonkeyPatch):
     expected = _results(scene, _transport(scene, monkeypatch, wide=False))
     wide = _transport(scene, monkeypatch, wide=True)
     windows = wide.layout.reads[2].windows
-    assert windows is not None and windows.count > 0  # the floor's planes
+    assert windows is not None and (windows.count > 0) == (name != "vacuum")
     for found, right in zip(_results(scene, wide), expected, strict=True):
         np.testing.assert_allclose(found, right, rtol=1e-11, atol=1e-12 * np.abs(right).max())
 

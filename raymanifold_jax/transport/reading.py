@@ -83,7 +83,7 @@ class Crowd(NamedTuple):
 
     def each(self, one: Callable[[Int[Array, ""], T], T], state: T) -> T:
         """`one(plane, state)` for each of the crowded planes."""
-        if self.windows is None:
+        if self.windows is None or not self.count:
             return state
         planes = self.windows.crowded
         return lax.fori_loop(0, self.count, lambda which, state: one(planes[which], state), state)
