@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import functools
 import math
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
@@ -29,6 +28,7 @@ from . import checks
 from .arrays import real_dtype
 from .programs import program
 from .scene import MIRROR, PERIODIC, Scene
+from .transport.cores import count_cores
 
 _BLOCK = 1 << 14  # rays a call
 _BUNDLE = 1 << 10  # rays that step together: neighbours end at about the same time
@@ -161,8 +161,7 @@ def _as_here(x64: bool, device: Any, run: Callable, rays: tuple[np.ndarray, ...]
 
 @functools.cache
 def _pool() -> ThreadPoolExecutor:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return ThreadPoolExecutor(cores, "rays")
+    return ThreadPoolExecutor(count_cores(), "rays")
 
 
 @program

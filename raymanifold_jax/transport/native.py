@@ -424,10 +424,14 @@ def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
         _readers(code, reads, marked(bits, wanted), number, surface, cut)
         for reads, bits, wanted in zip(layout.reads[axis].kinds, (own.hit_bits, own.probe_bits), (1, 0), strict=True)
     )
-    # Sorted by sense: the two senses meet planes in opposite order.
-    parts = _shared(np.argsort(-ways.sense, kind="stable"))
+    parts = _shared(_by_sense(ways))
     line = _frozen((ways, parts, shape, cut, ghosts, ~surface & ~ghost, hits, probes))
     return _Axis(*line, at(np.nonzero(~in_ghost)[0]), at(np.nonzero(in_ghost)[0]))
+
+
+def _by_sense(ways: machine_code.Ways) -> Int[np.ndarray, " N"]:
+    """All directions; the two senses meet planes in opposite order."""
+    return np.argsort(-ways.sense, kind="stable")
 
 
 def _shared(numbers: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -437,18 +441,17 @@ def _shared(numbers: np.ndarray) -> tuple[np.ndarray, ...]:
 
 def _lit(layout: Layout, line: _Axis, axis: int, inflow: Inflow | None) -> Int[np.ndarray, " n"]:
     """Of the directions those in which light comes in, where it comes from nowhere else."""
-    numbers = np.concatenate(line.parts)
+    ways, is_open = line.ways, np.asarray(layout.inflow_image) >= 0
+    numbers = _by_sense(ways)
     if inflow is None:
         return numbers[:0]
-    ways, is_open = line.ways, np.asarray(layout.inflow_image) >= 0
     shines = (np.asarray(inflow.radiance) != 0).any((0, 2))[ways.index]
     enters = np.zeros(len(shines), bool)
     for place, a in enumerate(AXES[axis]):
         for end, inward in ((0, 1), (-1, -1)):
             if layout.pad[a] and is_open.take(end, a).any():
                 enters |= inward * ways.toward[:, place] > 0
-    numbers = numbers[(shines & enters)[numbers]]
-    return numbers[np.argsort(-ways.sense[numbers], kind="stable")]
+    return numbers[(shines & enters)[numbers]]
 
 
 def _flat(cells: machine_code.Cells, area: int) -> np.ndarray:
