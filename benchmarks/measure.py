@@ -21,6 +21,8 @@ from typing import TYPE_CHECKING, Any
 from .record import peak_memory
 
 if TYPE_CHECKING:
+    from problems.case import Reader
+
     from raymanifold_jax.quadrature import Quadrature
 
 
@@ -59,6 +61,7 @@ QUADRATURES: Mapping[str, Callable[[int], "Quadrature"]] = MappingProxyType(
     {"fibonacci": _fibonacci, "cube": _cube, "light-ray-cube": _light_ray_cube, "product": _product}
 )
 DEFAULT = "default"  # what `rm.solve` takes
+_NONE: Mapping[str, Any] = MappingProxyType({})
 PAPER = "paper"  # the paper's scheme, which has its own directions
 
 
@@ -73,8 +76,8 @@ class Job:
     repeats: int = 1
 
 
-def measure(job: Job) -> dict[str, Any]:
-    """Solve and read, in this process. The record has no arrays."""
+def measure(job: Job, more: Mapping[str, "Reader"] = _NONE) -> dict[str, Any]:
+    """Solve and read, in this process, with the problem's readers and `more`. The record has no arrays."""
     import jax
     import problems
 
@@ -95,13 +98,16 @@ def measure(job: Job) -> dict[str, Any]:
         return solution
 
     first, solution = _timed(solve)
-    warm = [_timed(solve)[0] for _ in range(job.repeats)]
+    again = [_timed(solve) for _ in range(job.repeats)]
+    warm = [seconds for seconds, _ in again]
     read, quantities, targets = {}, {}, case.targets(job.size)
-    for name, reader in case.readers.items():
-        seconds, values = _timed(lambda reader=reader: reader(solution))
-        read[name] = _timed(lambda reader=reader: reader(solution))[0] if job.repeats else seconds
+    for number, (name, reader) in enumerate({**case.readers, **more}.items()):
+        read[name], values = _timed(lambda reader=reader: reader(solution))
+        if again:  # another solution, for which nothing is ready; with as many repeats as readers one for each
+            fresh = again[number % len(again)][1]
+            read[name] = _timed(lambda reader=reader, fresh=fresh: reader(fresh))[0]
         quantities |= {quantity: _errors(r, targets.get(quantity)) for quantity, r in values.items()}
-    again = statistics.median(warm) if warm else None
+    usual = statistics.median(warm) if warm else None
     return asdict(job) | {
         "title": case.title,
         "errors_of": case.errors_of,
@@ -109,9 +115,9 @@ def measure(job: Job) -> dict[str, Any]:
         "voxels": scene.lattice.size,
         "seconds": {
             "first": first,
-            "warm": again,
+            "warm": usual,
             "spread": max(warm) - min(warm) if warm else None,
-            "compile": None if again is None else first - again,
+            "compile": None if usual is None else first - usual,
             "read": read,
         },
         "memory": peak_memory(),
@@ -123,14 +129,19 @@ def measure(job: Job) -> dict[str, Any]:
     }
 
 
-def run(jobs: Iterable[Job], tell: Callable[[str], None]) -> Iterator[dict[str, Any]]:
-    """Records of jobs, one after the other, each from a fresh process; a job that fails gives a record with "error"."""
+def run(
+    jobs: Iterable[Job], tell: Callable[[str], None], more: Mapping[str, Mapping[str, "Reader"]] = _NONE
+) -> Iterator[dict[str, Any]]:
+    """Records of jobs, one after the other, each from a fresh process; a job that fails gives a record with "error".
+
+    `more`: further readers, by the name of the problem.
+    """
     for job in jobs:
         tell(f"{job.problem}, {job.size} voxels, {job.directions} directions ({job.quadrature})")
         # Spawned, because a fork of a process in which JAX runs can hang.
         with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
             try:
-                yield pool.submit(measure, job).result()
+                yield pool.submit(measure, job, dict(more.get(job.problem, {}))).result()
             except BrokenProcessPool:
                 yield asdict(job) | {"error": "the process died: out of memory?"}
             except (ValueError, RuntimeError, MemoryError) as error:

@@ -5,7 +5,7 @@ They are loaded with `optimize=False`: with the default, Mitsuba 3.9.1 stops sha
 scenes. Mitsuba runs in its fastest mode for one channel, `llvm_ad_mono`, on all cores; without LLVM 19 or newer, in
 `scalar_rgb`, which is slower and cannot be asked for single probes.
 
-Public names: `error_curve`; `start`, `open_box` and `rectangle` for other scenes.
+Public names: `error_curve`, `picture_curve`; `start`, `open_box` and `rectangle` for other scenes.
 """
 
 import os
@@ -18,8 +18,10 @@ from typing import Any
 import numpy as np
 
 _BLOCKS = 32
-# Samples of a probe and of a pixel in a pass: few, so that the time to an error is resolved, but enough for full speed.
-_SAMPLES = {"A": (512, 64), "C": (4096, 1024)}
+_PIXELS = 256  # a side of the picture
+# Samples of a probe, of a block and of a pixel in a pass: few, so that the time to an error is resolved, but enough for full
+# speed.
+_SAMPLES = {"A": (512, 64, 4), "C": (4096, 1024, 16)}
 _PASSES = 100_000
 _OFF = 5e-5
 
@@ -102,10 +104,10 @@ def _fog(mi: Any) -> dict[str, Any]:
     return scene
 
 
-def _sensor(mi: Any, height: float) -> dict[str, Any]:
-    """From above over exactly the unit square; a pixel is one block of the reference's means."""
+def _sensor(mi: Any, height: float, pixels: int) -> dict[str, Any]:
+    """From above over exactly the unit square."""
     columns = np.array([[0.5, 0, 0, 0.5], [0, -0.5, 0, 0.5], [0, 0, -1, height], [0, 0, 0, 1]])
-    film = {"type": "hdrfilm", "width": _BLOCKS, "height": _BLOCKS, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
+    film = {"type": "hdrfilm", "width": pixels, "height": pixels, "rfilter": {"type": "box"}, "pixel_format": "luminance"}
     place = mi.ScalarTransform4f(columns)
     return {"type": "orthographic", "to_world": place, "near_clip": 1e-4, "far_clip": 10.0, "film": film}
 
@@ -122,11 +124,10 @@ def error_curve(scene: str, quantity: str, seconds: float, goal: float) -> dict[
     """
     import problems
 
-    mi, variant = start()
-    loaded = mi.load_dict({"A": _room, "C": _fog}[scene](mi), optimize=False)
+    mi, variant, loaded = _loaded(scene)
     if quantity == "top view":
         expected, error = problems.top_view(scene)
-        render = _top_view(mi, loaded, scene)
+        render = _top_view(mi, loaded, scene, _BLOCKS, _SAMPLES[scene][1])
     else:
         rows = problems.probes(scene)["probes"]
         expected, error = (np.array([row[key] for row in rows]) for key in ("irradiance", "irradiance_se"))
@@ -141,25 +142,57 @@ def error_curve(scene: str, quantity: str, seconds: float, goal: float) -> dict[
         points.append((spent, float(np.sqrt(np.mean(relative**2))), float(np.mean(relative))))
         if spent >= seconds or (points[-1][1] <= goal and number >= 9):
             break
+    about = {"scene": scene, "quantity": quantity, "variant": variant, "mitsuba": mi.__version__, "bias": points[-1][2]}
+    return about | _curve(first, reference, [point[:2] for point in points], goal)
+
+
+def picture_curve(scene: str, halves: Path, seconds: float, goal: float) -> dict[str, Any]:
+    """The same for single pixels of the view from above, of which no reference is good enough.
+
+    Passes are rendered in pairs. The mean of the first of each and the mean of the second are independent, and half of what
+    they differ by has the error of both together: that is its rms, relative to the means of blocks. They are written to the
+    file `halves`, (2, pixels, pixels), for others to be compared with.
+    """
+    import problems
+
+    mi, variant, loaded = _loaded(scene)
+    render = _top_view(mi, loaded, scene, _PIXELS, _SAMPLES[scene][2])
+    first, _ = _timed(lambda: render(_PASSES))
+    total, spent, points = np.zeros((2, _PIXELS, _PIXELS)), 0.0, []
+    for number in range(_PASSES // 2):
+        for half in range(2):
+            passed, values = _timed(lambda seed=2 * number + half: render(seed))
+            total[half] += values
+            spent += passed
+        one, other = total / (number + 1)
+        scale = problems.spread_blocks(problems.in_blocks((one + other) / 2), _PIXELS)
+        points.append((spent, float(np.sqrt(np.mean(((one - other) / 2 / scale) ** 2)))))
+        if spent >= seconds or (points[-1][1] <= goal and number >= 9):
+            break
+    np.save(halves, np.stack([one, other]))
+    about = {"scene": scene, "quantity": "picture", "variant": variant, "mitsuba": mi.__version__}
+    return about | _curve(first, 0.0, points, goal)
+
+
+def _loaded(scene: str) -> tuple[Any, str, Any]:
+    mi, variant = start()
+    return mi, variant, mi.load_dict({"A": _room, "C": _fog}[scene](mi), optimize=False)
+
+
+def _curve(first: float, reference: float, points: list[tuple[float, float]], goal: float) -> dict[str, Any]:
     half = np.array(points[len(points) // 2 :])
     constant = float(np.mean(np.maximum(half[:, 1] ** 2 - reference**2, 0) * half[:, 0]))
     return {
-        "scene": scene,
-        "quantity": quantity,
-        "variant": variant,
-        "mitsuba": mi.__version__,
         "first_pass_seconds": first,
         "reference_error": reference,
-        "bias": points[-1][2],
-        "points": [point[:2] for point in points[:: max(1, len(points) // 50)]],
+        "points": points[:: max(1, len(points) // 50)],
         "seconds_to_goal": constant / goal**2,
         "reached": points[-1][1] <= goal,
     }
 
 
-def _top_view(mi: Any, scene: Any, name: str) -> Callable[[int], np.ndarray]:
-    sensor = mi.load_dict(_sensor(mi, 1 - 1e-3 if name == "A" else 1.5))
-    samples = _SAMPLES[name][1]
+def _top_view(mi: Any, scene: Any, name: str, pixels: int, samples: int) -> Callable[[int], np.ndarray]:
+    sensor = mi.load_dict(_sensor(mi, 1 - 1e-3 if name == "A" else 1.5, pixels))
     # Its x axis runs the other way.
     return lambda seed: np.array(mi.render(scene, sensor=sensor, spp=samples, seed=seed), float)[:, ::-1, 0]
 

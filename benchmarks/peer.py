@@ -2,23 +2,31 @@
 
 For ours, every size and number of directions is one point: the seconds of a solve and of reading the quantity out, without
 compilation, against the rms error. Mitsuba's error falls as one over the root of its time; the time to the goal is read off
-its own curve. One solve of ours serves both quantities (and any view); Mitsuba starts anew for each.
+its own curve. From the errors of both the reference's own is taken out. One solve of ours serves all quantities (and any view);
+Mitsuba starts anew for each.
+
+The quantities: "irradiance" at some 100 probes, "top view", the view from above as 32 x 32 means, and "picture", its 256 x 256
+pixels. For the last Mitsuba's own renderings of this run are the reference.
 
 Public names: `compare`, `Comparison`.
 """
 
+import math
 import multiprocessing
+import tempfile
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from .measure import Job, run
-from .mitsuba_scenes import error_curve
+from .mitsuba_scenes import error_curve, picture_curve
 from .table import seconds_text
 
 PROBLEMS = {"A": "room", "C": "fog"}
-READERS = {"irradiance": "probes", "top view": "top view"}  # quantity: who reads it
+READERS = {"irradiance": "probes", "top view": "top view", "picture": "picture"}  # quantity: who reads it
 
 
 @dataclass(frozen=True)
@@ -61,14 +69,21 @@ def compare(
     tell: Callable[[str], None],
 ) -> Comparison:
     """Measure both. **Raises** `RuntimeError` if Mitsuba is not there."""
+    import problems
+
     curves = []
-    for scene in scenes:
-        for quantity in READERS:
-            tell(f"Mitsuba, scene {scene}, {quantity}")
-            with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-                curves.append(pool.submit(error_curve, scene, quantity, seconds, goal).result())
-    jobs = [Job(PROBLEMS[scene], size, count, repeats=2) for scene in scenes for size in sizes for count in counts]
-    ours = list(run(jobs, tell))
+    with tempfile.TemporaryDirectory() as folder:
+        more: dict[str, dict[str, Any]] = {}
+        for scene in scenes:
+            halves = Path(folder, f"{scene}.npy")
+            more[PROBLEMS[scene]] = {"picture": partial(problems.read_picture, scene, halves)}
+            for quantity in READERS:
+                tell(f"Mitsuba, scene {scene}, {quantity}")
+                curve = partial(picture_curve, scene, halves) if quantity == "picture" else partial(error_curve, scene, quantity)
+                with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+                    curves.append(pool.submit(curve, seconds, goal).result())
+        jobs = [Job(PROBLEMS[scene], size, count, repeats=len(READERS)) for scene in scenes for size in sizes for count in counts]
+        ours = list(run(jobs, tell, more))
     return Comparison(ours, curves, [_summary(curve, ours, goal) for curve in curves])
 
 
@@ -88,14 +103,14 @@ def _summary(curve: dict[str, Any], ours: list[dict[str, Any]], goal: float) -> 
 
 
 def point(record: dict[str, Any], quantity: str) -> dict[str, Any]:
-    """Seconds and rms error of one record for one quantity."""
-    seconds = record["seconds"]
+    """Seconds of one record, and the rms error of one quantity, less the reference's own."""
+    seconds, errors = record["seconds"], record["quantities"][quantity]
     read = seconds["read"][READERS.get(quantity, "probes")]
     solve = seconds["first"] if seconds["warm"] is None else seconds["warm"]
     return {
         "seconds": solve + read,
         "first": seconds["first"] + read,
-        "rms": record["quantities"][quantity]["rms"],
+        "rms": math.sqrt(max(errors["rms"] ** 2 - errors["reference_error"] ** 2, 0.0)),
         "size": record["size"],
         "directions": record["directions"],
         "quadrature": record["quadrature"],

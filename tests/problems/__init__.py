@@ -15,5 +15,8 @@ from .closed_form import *  # noqa: F403
 from .data import probes as probes
 from .data import table as table
 from .data import top_view as top_view
+from .rendered import in_blocks as in_blocks
+from .rendered import read_picture as read_picture
+from .rendered import spread_blocks as spread_blocks
 
 CASES = MappingProxyType({case.name: case for case in (*media.CASES, *enclosures.CASES, *rendered.CASES)})

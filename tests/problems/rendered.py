@@ -1,6 +1,7 @@
 """The two scenes that another program has solved: irradiance and fluence at probes, and a picture (`data/README.md`)."""
 
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -9,7 +10,7 @@ import raymanifold_jax as rm
 from .case import Case, Reader, Readings, Target, joined, readings
 from .data import columns, probes, top_view
 
-_BLOCKS = 32  # a side of the picture
+BLOCKS = 32  # a side of the picture
 
 
 def read_probes(name: str, solution: rm.Solution) -> dict[str, Readings]:
@@ -27,16 +28,41 @@ def read_probes(name: str, solution: rm.Solution) -> dict[str, Readings]:
     return read
 
 
-def read_top_view(name: str, solution: rm.Solution, pixels: int = 256, samples: int = 1) -> dict[str, Readings]:
-    """The view from above, as means of 32 x 32 blocks: of scene "A" from just below its ceiling."""
+def read_top_view(name: str, solution: rm.Solution) -> dict[str, Readings]:
+    """The view from above, as means of 32 x 32 blocks."""
+    return {"top view": readings(in_blocks(_picture(name, solution)), *top_view(name))}
+
+
+def read_picture(name: str, halves: Path, solution: rm.Solution) -> dict[str, Readings]:
+    """The same view pixel by pixel, against two independent renderings in a file, (2, pixels, pixels).
+
+    Errors are relative to the mean of a pixel's block, whose noise is small. The renderings' own error is half of what they
+    differ by, so that rms^2 - reference_error^2 is the mean of (ours - one) (ours - other): free of their noise.
+    """
+    one, other = np.load(halves)
+    mean = (one + other) / 2
+    ours = _picture(name, solution, len(one))
+    return {"picture": readings(ours, mean, np.abs(one - other) / 2, spread_blocks(in_blocks(mean), len(one)))}
+
+
+def in_blocks(picture: np.ndarray) -> np.ndarray:
+    """Means of the blocks of a picture."""
+    block = len(picture) // BLOCKS
+    return picture.reshape(BLOCKS, block, BLOCKS, block).mean((1, 3))
+
+
+def spread_blocks(means: np.ndarray, pixels: int) -> np.ndarray:
+    """The mean of its block for each pixel of a picture."""
+    return np.kron(means, np.ones((pixels // BLOCKS,) * 2))
+
+
+def _picture(name: str, solution: rm.Solution, pixels: int = 256, samples: int = 1) -> np.ndarray:
+    """What is seen from above, of scene "A" from just below its ceiling."""
     height = 1 - 1e-3 if name == "A" else 1.0
     camera = rm.OrthographicCamera(
         (0.5, 0.5, height), (0, 0, -1), (0, 1, 0), width=1.0, resolution=(pixels, pixels), row0="lower"
     )
-    picture = np.asarray(rm.render(solution, camera, samples), float)
-    block = pixels // _BLOCKS
-    ours = picture.reshape(_BLOCKS, block, _BLOCKS, block).mean((1, 3))
-    return {"top view": readings(ours, *top_view(name))}
+    return np.asarray(rm.render(solution, camera, samples), float)
 
 
 def _readers(name: str) -> dict[str, Reader]:
