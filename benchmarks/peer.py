@@ -79,10 +79,12 @@ def compare(
             more[PROBLEMS[scene]] = {"picture": partial(problems.read_picture, scene, halves)}
             for quantity in READERS:
                 tell(f"Mitsuba, scene {scene}, {quantity}")
-                curve = partial(picture_curve, scene, halves) if quantity == "picture" else partial(error_curve, scene, quantity)
+                single = quantity == "picture"
+                curve = partial(picture_curve, scene, halves) if single else partial(error_curve, scene, quantity)
                 with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
                     curves.append(pool.submit(curve, seconds, goal).result())
-        jobs = [Job(PROBLEMS[scene], size, count, repeats=len(READERS)) for scene in scenes for size in sizes for count in counts]
+        of = lambda scene, size, count: Job(PROBLEMS[scene], size, count, repeats=len(READERS))
+        jobs = [of(scene, size, count) for scene in scenes for size in sizes for count in counts]
         ours = list(run(jobs, tell, more))
     return Comparison(ours, curves, [_summary(curve, ours, goal) for curve in curves])
 

@@ -3,8 +3,8 @@
 `jnp.asarray` makes a program for every shape that it copies or converts, which takes JAX some milliseconds each at the start
 of every process; here numpy converts. So does every other operation outside of `jit`: numpy does them where numbers are known.
 
-Public: `as_jax`, `zeros_like`, `ones_like`, `real_dtype`, `numpy_or_jax`, `numpy_or_jax_of`, `worked_out_now`, `stop_gradient`,
-`on_accelerator`.
+Public: `as_jax`, `zeros_like`, `ones_like`, `real_dtype`, `numpy_or_jax`, `numpy_or_jax_of`, `is_staging`, `worked_out_now`,
+`stop_gradient`, `on_accelerator`.
 """
 
 from __future__ import annotations
@@ -69,10 +69,14 @@ def numpy_or_jax_of(array: Any) -> ModuleType:
     return np if isinstance(array, np.ndarray) else jnp
 
 
+def is_staging() -> bool:
+    """Whether JAX stages what is done now, with known numbers too."""
+    return checks.is_traced(jax.device_put(np.zeros(())))
+
+
 def worked_out_now() -> AbstractContextManager:
     """For what no parameter moves: it is known even while JAX stages the rest."""
-    staging = checks.is_traced(jax.device_put(np.zeros(())))
-    return jax.ensure_compile_time_eval() if staging else nullcontext()
+    return jax.ensure_compile_time_eval() if is_staging() else nullcontext()
 
 
 def stop_gradient(tree: T) -> T:

@@ -162,10 +162,10 @@ def test_ball_under_half_a_sky():
 # Symmetries
 
 
-def assert_turns_along(lattice: rm.Lattice, turn: np.ndarray, rtol: float, **parts) -> None:
+def assert_turns_along(lattice: rm.Lattice, turn: np.ndarray, rtol: float, solved_to: float = 1e-4, **parts) -> None:
     """The solution of the turned scene in turned directions is the solution turned."""
-    before = solve(problems.asymmetric(lattice, np.eye(3), **parts), rtol=1e-4)
-    after = solve(problems.asymmetric(lattice, turn, **parts), DIRECTIONS.rotate(turn), rtol=1e-4)
+    before = solve(problems.asymmetric(lattice, np.eye(3), **parts), rtol=solved_to)
+    after = solve(problems.asymmetric(lattice, turn, **parts), DIRECTIONS.rotate(turn), rtol=solved_to)
     field = problems.turned_field(np.asarray(before.fluence), turn)
     assert field.shape == after.fluence.shape
     np.testing.assert_allclose(after.fluence, field, rtol=rtol, atol=rtol * field.max())
@@ -187,9 +187,10 @@ def test_quarter_turns_turn_the_solution(axis):
 
 @pytest.mark.slow
 def test_axes_of_unequal_length_may_be_exchanged(x64):
-    # x -> y -> z -> x on a lattice of 8 x 12 x 10 with everything in it, a sun too, to 64-bit rounding.
+    # x -> y -> z -> x on a lattice of 8 x 12 x 10 with everything in it, a sun too. Error budget: the four points of an emitter's
+    # patch do not turn with the scene, which leaves 2e-7 of the brightest; what is left of the iteration is below that.
     cyclic = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
-    assert_turns_along(rm.Lattice((8, 12, 10)), cyclic, rtol=1e-11)
+    assert_turns_along(rm.Lattice((8, 12, 10)), cyclic, rtol=2e-6, solved_to=1e-12)
 
 
 # Sides

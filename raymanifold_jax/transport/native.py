@@ -16,7 +16,7 @@ import functools
 import importlib
 import importlib.util
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
@@ -111,7 +111,7 @@ def sweep(
     in_voxels = np.zeros((bands, *layout.padded), real)
     dark = not sent.any() and not any(np.asarray(field).any() for field in (volume, *(slopes or ())) if field is not None)
 
-    def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
+    def begin(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> Callable[[], None]:
         planes, cut, hits, probes = arguments
         readers = hits, probes
         light = _frozen(code.Light(
@@ -133,14 +133,18 @@ def sweep(
                 code.forwards(*known, _work(code, line, directions, real), *sums, voxels)
             return sums, voxels
 
-        for sums, voxels in on_cores(run, _shared(_lit(layout, line, axis, inflow)) if dark else line.parts):
-            for of_kind, of_readers in zip(readers, sums, strict=True):
-                at_elements[:] += [np.bincount(of_kind.element, band, layout.elements) for band in of_readers]
-            if manner.fluence:
-                in_voxels[:] += _from_planes(voxels, axis, line.shape)
+        parts = on_cores(run, _shared(_lit(layout, line, axis, inflow)) if dark else line.parts)
 
-    for line in _lines(manner, layout, ordinates, extinction, bands, sloped, real):
-        along(*line)
+        def add_up() -> None:
+            for sums, voxels in parts:
+                for of_kind, of_readers in zip(readers, sums, strict=True):
+                    at_elements[:] += [np.bincount(of_kind.element, band, layout.elements) for band in of_readers]
+                if manner.fluence:
+                    in_voxels[:] += _from_planes(voxels, axis, line.shape)
+
+        return add_up
+
+    _one_after_the_other(begin, _lines(manner, layout, ordinates, extinction, bands, sloped, real))
     voxels = as_jax(layout.from_padded(in_voxels)) if manner.fluence else None
     return as_jax(at_elements, real), voxels
 
@@ -166,7 +170,7 @@ def unsweep(
     fields = [np.zeros((bands, *layout.padded), real) for _ in range(medium * (1 + 3 * sloped))]
     manner = dataclasses.replace(manner, fluence=volume is not None)
 
-    def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
+    def begin(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> Callable[[], None]:
         planes, cut, hits, probes = arguments
         readers = hits, probes
         wanted = _frozen(np.zeros((1, bands, 1), real) if volume is None else _planes(volume, axis))
@@ -181,15 +185,19 @@ def unsweep(
             code.backwards(part, line.ways, planes, cut, line.ghosts, hits, probes, how, work, of_hits, of_probes, wanted, back)
             return back
 
-        for back in on_cores(run, line.parts):
-            for values, at in ((back.cut, line.at_cut), (back.ghost, line.at_ghost)):
-                exitance[:] += _scattered(values, layout, at)
-            found = [back.source, *(back.slopes[AXES[axis].index(a)] for a in range(3))]
-            for field, of_planes in zip(fields, found, strict=False):
-                field += _from_planes(of_planes, axis, line.shape)
+        parts = on_cores(run, line.parts)
 
-    for line in _lines(manner, layout, ordinates, extinction, bands, sloped, real):
-        along(*line)
+        def add_up() -> None:
+            for back in parts:
+                for values, at in ((back.cut, line.at_cut), (back.ghost, line.at_ghost)):
+                    exitance[:] += _scattered(values, layout, at)
+                found = [back.source, *(back.slopes[AXES[axis].index(a)] for a in range(3))]
+                for field, of_planes in zip(fields, found, strict=False):
+                    field += _from_planes(of_planes, axis, line.shape)
+
+        return add_up
+
+    _one_after_the_other(begin, _lines(manner, layout, ordinates, extinction, bands, sloped, real))
     source = as_jax(layout.from_padded(fields[0])) if medium else None
     return as_jax(exitance, real), source, tuple(map(as_jax, fields[1:])) if sloped else None
 
@@ -296,6 +304,16 @@ def _lines(manner: Any, layout: Layout, ordinates, extinction, bands: int, slope
             yield axis, line, _frozen(arguments), _manner(code, manner, medium, sloped, line, real)
 
 
+def _one_after_the_other(begin: Callable[..., Callable[[], None]], lines: Iterable[tuple]) -> None:
+    """Begin with each axis before the one before it is added up: the cores do not wait for that."""
+    add_up: Callable[[], None] = lambda: None
+    for line in lines:
+        next_one = begin(*line)
+        add_up()
+        add_up = next_one
+    add_up()
+
+
 def _manner(code, manner: Any, medium: _Medium, sloped: bool, line: _Axis, real) -> machine_code.Manner:
     rows = max(2, _RAYS // max(line.area, 1))
     thin = bool(manner.thin and not sloped)
@@ -311,9 +329,9 @@ def _work(code, line: _Axis, directions: int, real) -> machine_code.Work:
     size, width = line.area, line.shape[2]
     return code.Work(
         rows=np.zeros((directions + 4, size + 2 * width), real), nowhere=np.zeros(size, real), asked=np.zeros((3, size), real),
-        here=np.zeros((12, int(np.diff(line.cut.first).max())), real), own=np.zeros(directions, int), free=np.zeros(4, int),
+        here=_cut_blocks(code, line, real), sent=_of_ghosts(line, real), own=np.zeros(directions, int), free=np.zeros(4, int),
         point=np.zeros(3), whole=np.zeros(3), form=np.zeros((code.ROWS + 1) * code.BLOCK),
-        picked=np.zeros(_most(line), np.int32), at=np.zeros(code.BLOCK, np.int32), way=_segments(code),
+        picked=np.zeros(_most(line), np.uint32), at=np.zeros(code.BLOCK, np.uint32), way=_segments(code),
     )  # fmt: skip
 
 
@@ -321,15 +339,24 @@ def _standing(code, line: _Axis, directions: int, real) -> machine_code.Standing
     most = _most(line)
     return code.Standing(
         rows=np.zeros((directions, line.area), real), shift=np.zeros(directions, int), nowhere=np.zeros(1, real),
-        hits=np.zeros((3, most), real), probes=np.zeros((3, most), real), picked=np.zeros((2, most), np.int32),
-        here=np.zeros((7, int(np.diff(line.cut.first).max())), real), form=np.zeros((code.ROWS + 1) * code.BLOCK),
-        at=np.zeros(code.BLOCK, np.int32), way=_segments(code),
+        hits=np.zeros((3, most), real), probes=np.zeros((3, most), real), picked=np.zeros((2, most), np.uint32),
+        here=_cut_blocks(code, line, real), sent=_of_ghosts(line, real), form=np.zeros((code.ROWS + 1) * code.BLOCK),
+        at=np.zeros(code.BLOCK, np.uint32), way=_segments(code),
     )  # fmt: skip
 
 
+def _cut_blocks(code, line: _Axis, real) -> np.ndarray:
+    most = int(np.diff(line.cut.first).max())
+    return np.zeros(-(-most // code.CUT_BLOCK) * code.CUT_BLOCK * code.CUT_ROWS, real)
+
+
+def _of_ghosts(line: _Axis, real) -> np.ndarray:
+    return np.zeros(int(np.diff(line.ghosts.first).max()), real)
+
+
 def _most(line: _Axis) -> int:
-    """Readers of one kind in a plane, at most, and at least one."""
-    return max(1, *(int(np.diff(r.first[r.runs]).max(initial=0)) for r in (line.hits, line.probes)))
+    """Readers of one kind in a plane, at most, and at least one; and the places that are written ahead."""
+    return 7 + max(1, *(int(np.diff(r.first[r.runs]).max(initial=0)) for r in (line.hits, line.probes)))
 
 
 def _arguments(code, layout: Layout, line: _Axis, medium: _Medium, axis: int) -> tuple:
@@ -464,7 +491,7 @@ def _cells(code, chosen: np.ndarray, plane, image: np.ndarray | None, real: np.d
     none = np.zeros((4, 0), real)
     return code.Cells(
         first=first,
-        cell=cell,
+        cell=cell.astype(np.uint32),
         plane=none if plane is None else np.array([values[number, cell] for values in plane], real),
         extinction=none,
         image=np.zeros(0, int) if image is None else image[number, cell].astype(int),
@@ -497,13 +524,18 @@ def _readers(
         plane=planes,
         height=face[4, order],
         cut=cut,
-        cell=cell[order].astype(np.int32),
-        element=np.asarray(reads.element)[used][order].astype(int),
+        cell=_to_bytes(cell[order].astype(np.uint32)),
+        element=_to_bytes(np.asarray(reads.element)[used][order].astype(int)),
         bits=_packed_marks(code, marked, used[order], face[:4, order]),
         even=np.zeros((1, 0), bool),
         depth=np.zeros((1, 0)),
         extinction=np.zeros((1, 0)),
     )
+
+
+def _to_bytes(of_readers: np.ndarray) -> np.ndarray:
+    """With 0 behind the last, up to whole bytes of their marks."""
+    return np.pad(of_readers, (0, -len(of_readers) % 8))
 
 
 def _packed_marks(code, marked: tuple, image: np.ndarray, face: np.ndarray) -> np.ndarray:
@@ -556,8 +588,8 @@ def _make_medium(line: _Axis, axis: int, extinction: Float[Array, "C X Y Z"], re
     number = lambda first: np.repeat(np.arange(len(first) - 1), np.diff(first))
 
     def of_readers(r: machine_code.Readers):
-        each = planes[number(r.runs)[number(r.first)], :, r.cell].T.astype(float)
-        least, most = (f.reduceat(each, r.first[:-1], axis=1) if len(r.cell) else each for f in (np.minimum, np.maximum))
+        each = planes[number(r.runs)[number(r.first)], :, r.cell[: r.first[-1]]].T.astype(float)
+        least, most = (f.reduceat(each, r.first[:-1], axis=1) if r.first[-1] else each for f in (np.minimum, np.maximum))
         return least == most, most, np.ascontiguousarray(each)
 
     cut = planes[number(line.cut.first), :, line.cut.cell].T

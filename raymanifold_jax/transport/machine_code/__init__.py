@@ -32,6 +32,8 @@ from .arguments import (
     Ways,
     Work,
 )
+from .cut import BLOCK as CUT_BLOCK
+from .cut import ROWS as CUT_ROWS
 from .evolution import backwards, forwards
 from .marks import mark, pack
 from .readers import BLOCK, ROWS
@@ -39,6 +41,8 @@ from .vacuum import follow, in_vacuum, views
 
 __all__ = [
     "BLOCK",
+    "CUT_BLOCK",
+    "CUT_ROWS",
     "EVEN",
     "PATCHY",
     "ROWS",

@@ -35,7 +35,7 @@ class Cells(NamedTuple):
     """Listed voxels, plane by plane: those of plane k are first[k] to first[k + 1]."""
 
     first: Any  # [K + 1]
-    cell: Any  # [J] flat in the plane
+    cell: Any  # [J] flat in the plane; unsigned, because numba looks whether other numbers are negative
     plane: Any  # [4, J] offset and normal of its surface; ghosts: nothing
     extinction: Any  # [C, J]
     image: Any  # [J] of ghosts that are open: their mirror image, else -1
@@ -53,7 +53,7 @@ class Readers(NamedTuple):
     plane: Any  # [4, M] and of that in their voxel; (1, 0, 0, 0) where there is none
     height: Any  # [M]
     cut: Any  # [M] number of the voxel among the CUT ones, -1 where it is none
-    cell: Any  # [M]
+    cell: Any  # [M] unsigned
     element: Any  # [M]
     bits: Any  # [N, M / 8] whether it reads in a direction, which comes from before it
     even: Any  # [C, R] whether all of the run have the extinction `depth`
@@ -121,7 +121,8 @@ class Work(NamedTuple):
     rows: Any  # [rows + 4, P + 2 width] rays, both ends joined
     nowhere: Any  # [P]
     asked: Any  # [3, P] of the rays before each segment (backwards)
-    here: Any  # [12, most CUT voxels in a plane]
+    here: Any  # blocks of CUT voxels (see `cut`)
+    sent: Any  # [most ghosts in a plane]
     own: Any  # [rows] which row holds the rays of each direction
     free: Any  # [4] rows that hold none
     point: Any  # [3]
@@ -141,7 +142,8 @@ class Standing(NamedTuple):
     hits: Any  # [3, most of a plane] rays before each segment, as those read them that are `picked`
     probes: Any
     picked: Any  # [2, most of a plane] hits and probes that read in a direction
-    here: Any  # [7, most CUT voxels in a plane] as in `Work`, of which vacuum needs three rows
+    here: Any  # as in `Work`
+    sent: Any
     form: Any  # [(ROWS + 1) * BLOCK]
     at: Any  # [BLOCK]
     way: Any  # Segments

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numba
+from numba.extending import register_jitable
 
 try:
     import fcntl
@@ -22,7 +23,12 @@ except ImportError:  # Windows, where each process compiles
 _OPTIONS: Any = dict(fastmath={"contract", "nsz"}, error_model="numpy", _nrt=False, no_cfunc_wrapper=True)
 
 # Called by entries only. Numba would compile a way in from Python for each, which takes apart all the tuples.
-compiled: Any = numba.njit(no_cpython_wrapper=True, **_OPTIONS)  # pyright: ignore[reportCallIssue]
+# Not `inlined`, as they otherwise would be where they are called by what is.
+compiled: Any = numba.njit(no_cpython_wrapper=True, forceinline=False, **_OPTIONS)  # pyright: ignore[reportCallIssue]
+
+# Where LLVM would leave a function of its own, loops around it would not be vectorised, and what it takes would go through the
+# stack in every call: for tuples of arrays that is hundreds of numbers.
+inlined: Any = register_jitable(forceinline=True)
 
 
 def entry(function: Callable) -> Any:

@@ -5,10 +5,11 @@ from __future__ import annotations
 from numba.extending import register_jitable
 
 from .compiling import compiled, entry
+from .cut import back_cut, give_cut, keep_cut, put_cut, take_cut, through_cut
 from .paths import chords, join_ends, turn
 from .readers import ask, read
-from .voxels import from_ghosts, put_cut, take_cut, through_cut, through_free
-from .voxels_back import back_cut, back_free, back_ghosts, give_cut, keep_cut
+from .voxels import from_ghosts, light_of_ghosts, through_free
+from .voxels_back import back_free, back_ghosts
 
 
 @register_jitable
@@ -50,13 +51,14 @@ def forwards(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wor
                     k = when % count if sense > 0 else count - 1 - when % count
                     sums = in_voxels[k, c] if reading and manner.fluence else work.nowhere
                     dark = ghosts.first[k + 1] - ghosts.first[k] == size
-                    take_cut(cut, k, c, light, sums, manner, here)
+                    take_cut(cut, k, c, light, True, sums, manner, here)
                     for b in range(len(batch)):
                         n = batch[b]
                         if ways.sense[n] != sense or when < -(ways.laps[n] - 1) * count:
                             continue
                         length = planes.spacing / abs(ways.toward[n, 0])
                         segments = chords(ways, n, when, planes.width, planes.wrap_v, way)
+                        light_of_ghosts(ghosts, k, c, n, ways, light, work.sent)
                         weight, row = ways.weight[n], way.row
                         row[0], row[1], row[2], row[3] = own[b], free[0], free[1], free[2]
                         for number in range(segments):
@@ -70,8 +72,8 @@ def forwards(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wor
                             come, gone = before[margin - move : margin - move + size], after[margin : margin + size]
                             if not dark:
                                 through_free(planes, k, c, number, way, length, come, gone, light, manner, work, sums, weight)
-                            through_cut(cut, k, c, number, way, length, before, after, margin, light, manner, here, weight)
-                            from_ghosts(ghosts, k, c, n, ways, after, margin, light)
+                            through_cut(cut, k, number, way, length, come, gone, manner, here, weight)
+                            from_ghosts(ghosts, k, gone, work.sent)
                             join_ends(after, margin, size)
                         if reading:
                             there = length, margin, light, planes.spacing, manner, work
@@ -111,7 +113,7 @@ def backwards(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_
                     k = when % count if sense > 0 else count - 1 - when % count
                     wanted = in_voxels[k, c] if reading and manner.fluence else work.nowhere
                     dark = ghosts.first[k + 1] - ghosts.first[k] == size
-                    keep_cut(cut, k, c, back, manner, here)
+                    keep_cut(cut, k, c, wanted, back, manner, here)
                     for b in range(len(batch)):
                         n = batch[b]
                         if ways.sense[n] != sense or when < -(ways.laps[n] - 1) * count:
@@ -132,9 +134,8 @@ def backwards(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_
                             if not dark:
                                 of_plane = gone, come, ask_of, wanted, back, manner, work, weight
                                 back_free(planes, k, c, number, way, length, *of_plane)
-                            of_cut = ask_of, margin, wanted, back.cut, manner, here, weight
-                            back_cut(cut, k, c, number, way, length, after, before, *of_cut)
-                            back_ghosts(ghosts, k, c, after, before, ask_of, margin, back.ghost)
+                            back_cut(cut, k, number, way, length, gone, come, ask_of, manner, here, weight)
+                            back_ghosts(ghosts, k, c, gone, come, ask_of, back.ghost)
                             join_ends(before, margin, size)
                             own[b], free[0] = free[0], own[b]
                             move = way.move[number]

@@ -8,7 +8,7 @@ import numba
 import numpy as np
 from numba.extending import overload, register_jitable
 
-from .compiling import compiled
+from .compiling import compiled, inlined
 
 
 def exp(x):
@@ -30,7 +30,7 @@ def _of_double(x):
     return y * np.int64(octave + np.int64(1023 << 52)).view(np.float64)
 
 
-@overload(exp)
+@overload(exp, jit_options={"forceinline": True})
 def _exp_of(x):
     """Of numbers up to 0, by polynomials, which vectorise: in 32 bits (Cephes) to 1 in 10^7, in 64 bits to rounding."""
     if x != numba.float32:
@@ -55,7 +55,7 @@ def _exp_of(x):
     return of_single
 
 
-@register_jitable
+@inlined
 def mean_of(tau):
     """(1 - exp(-tau)) / tau of a thin path."""
     real = type(tau)
@@ -63,7 +63,7 @@ def mean_of(tau):
     return real(1) - tau * (c2 - tau * (c3 - tau * (c4 - tau * (c5 - tau * (c6 - tau * c7)))))
 
 
-@register_jitable
+@inlined
 def bend_of(tau):
     """((1 + exp(-tau)) / 2 - mean) / tau of a thin path."""
     real = type(tau)
@@ -92,7 +92,7 @@ def _crossing(start, slope, step):
     return place - 0.5, moved, when
 
 
-@compiled
+@inlined
 def chords(ways, n, step, width, wrap_v, way):
     """The segments between plane `step` and the next, written to `way`; returns how many: the last ones may be empty."""
     share, begin, end, move = way.share, way.begin, way.end, way.move

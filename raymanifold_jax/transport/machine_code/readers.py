@@ -13,7 +13,8 @@ from numba.extending import register_jitable
 
 from ..reading import BEHIND, ONWARD
 from ..slopes import THIN
-from .compiling import compiled
+from .compiling import compiled, inlined
+from .cut import ask_cut
 from .paths import bend_of, exp, mean_of
 
 BLOCK = 128
@@ -27,6 +28,10 @@ _A, _U, _V = _row(4), _row(5), _row(6)
 _OF, _OT, _OH, _OD = _row(FACTOR), _row(_TOTAL), _row(_HEIGHT), _row(_DEPTH)
 _F0, _F1, _F2, _F3 = (_row(_FACE + i) for i in range(4))
 _P0, _P1, _P2, _P3 = (_row(_PLANE + i) for i in range(4))
+
+#: Of each byte of marks: their places, and how many they are.
+_PLACES = np.array([([i for i in range(8) if byte >> i & 1] + [0] * 8)[:8] for byte in range(256)], np.uint32)
+_MARKED = np.array([byte.bit_count() for byte in range(256)], np.uintp)
 
 
 @register_jitable
@@ -50,7 +55,7 @@ def faces_away(readers, m, ways, n):
     return tilt(readers.face, m, ways.toward[n, 0], ways.toward[n, 1], ways.toward[n, 2]) >= 0
 
 
-@register_jitable
+@inlined
 def attenuations(tau, limit):
     """As `paths.attenuation`, without a branch."""
     thin, thick, kept = tau < limit, max(tau, limit), exp(-tau)
@@ -59,18 +64,28 @@ def attenuations(tau, limit):
     return 1 - tau * mean if thin else kept, mean, bend
 
 
+@register_jitable
+def _marks_within(bits, n, byte, first, last):
+    """Eight marks, but for those of readers before `first` and from `last` on."""
+    marks = np.int64(bits[n, byte])
+    if 8 * byte < first:
+        marks &= 255 << (first - 8 * byte)
+    if 8 * byte + 8 > last:
+        marks &= 255 >> (8 * byte + 8 - last)
+    return np.uintp(marks)
+
+
 @compiled
 def pick_marked(bits, n, first, last, picked):
-    """Write those of readers `first` to `last` that read in a direction to `picked`, and return how many."""
-    count = 0
+    """Write those of readers `first` to `last` that read in a direction to `picked`, which has room for 7 more; how many."""
+    count = np.uintp(0)
     for byte in range(first >> 3, (last + 7) >> 3):
-        marks = bits[n, byte]
-        if marks == 0:
-            continue
-        for m in range(max(8 * byte, first), min(8 * byte + 8, last)):
-            picked[count] = m  # without a branch: a processor cannot guess the marks
-            count += (marks >> np.uint8(m & 7)) & np.uint8(1)
-    return count
+        marks = _marks_within(bits, n, byte, first, last)
+        if marks != 0:
+            for i in range(8):  # always as many, without a branch: a processor cannot guess the marks
+                picked[count + np.uintp(i)] = np.uint32(8 * byte) + _PLACES[marks, i]
+            count += _MARKED[marks]
+    return np.int64(count)
 
 
 @compiled
@@ -79,13 +94,20 @@ def take(to, values, picked):
         to[i] = values[picked[i]]
 
 
+@compiled
+def take_cut_numbers(to, cut, picked):
+    """The numbers of the CUT voxels that readers are in; any number where it is none: there is a 0 in the form for it."""
+    for i in range(len(picked)):
+        to[i] = max(cut[picked[i]], 0)
+
+
 @register_jitable
 def _used(r, manner):
     """Whether a row of the form is anything but 0: without a medium, or slopes, some are not looked at."""
     return r < 3 or r == 7 or (manner.medium and (r == 3 or manner.sloped))
 
 
-@compiled
+@inlined
 def _load(paths, readers, ways, n, picked, manner, form):
     """The surfaces of readers, and the cosine and the weight of a direction."""
     size, w = len(picked), ways.weight[n]
@@ -191,7 +213,7 @@ def _paths(form, size, to, b, s, share, length, spacing, limit, onward, sloped):
         form[j + to] = (1 - behind) * weight
 
 
-@compiled
+@inlined
 def forms_of(paths, readers, ways, n, c, picked, depth, count, way, length, spacing, manner, form):
     """The forms of the `picked` readers, times cosine and weight of the direction.
 
@@ -260,10 +282,18 @@ def next_block(readers, r, end, c, manner):
 
 
 @compiled
-def add_term(sums, bits, n, cell, first, last, factor, values):
-    """Without a branch: a processor cannot guess the marks."""
-    for m in range(first, last):
-        sums[m] += factor * marked(bits, n, m) * values[cell[m]]
+def add_terms(sums, bits, n, cell, first, last, f0, f1, f2, f3, v0, v1, v2, v3):
+    """Four terms at once, in those of the readers `first` to `last` that read: without a branch for each, which a processor
+    cannot guess."""
+    for byte in range(first >> 3, (last + 7) >> 3):
+        marks = _marks_within(bits, n, byte, first, last)
+        if marks == 0:
+            continue
+        for i in range(8):
+            m = np.uintp(8 * byte + i)
+            at = cell[m]
+            total = f0 * v0[at] + f1 * v1[at] + f2 * v2[at] + f3 * v3[at]
+            sums[m] += np.float64((marks >> np.uintp(i)) & np.uintp(1)) * total
 
 
 @compiled
@@ -272,7 +302,7 @@ def add_each(total, form, values, at):
         total[i] += form[i] * values[at[i]]
 
 
-@compiled
+@inlined
 def _read_block(readers, c, k, picked, count, rows, way, margin, light, manner, form, at, sums):
     size = len(picked)
     total, at = form[ROWS * BLOCK : ROWS * BLOCK + size], at[:size]
@@ -286,41 +316,56 @@ def _read_block(readers, c, k, picked, count, rows, way, margin, light, manner, 
         for d in range(3):
             add_each(total, form[(4 + d) * BLOCK :], light.slopes[d][k, c], at)
     if light.cut.shape[1]:
-        take(at, readers.cut, picked)
+        take_cut_numbers(at, readers.cut, picked)
         add_each(total, form[7 * BLOCK :], light.cut[c], at)
     for i in range(size):
         sums[c, picked[i]] += total[i]
 
 
-@compiled
+@inlined
+def _next_part(readers, r, end, ways, n, c, manner, picked):
+    """Of the runs from r on the next whose elements share a form, or all up to there, which have one each.
+
+    Returns the run behind them, how many forms there are, of which readers those are `picked`, and which kind it is.
+    """
+    first = readers.first[r]
+    if shared(readers, r, c, manner):
+        picked[0] = first
+        return r + 1, 0 if faces_away(readers, first, ways, n) else 1, True
+    r = next_block(readers, r, end, c, manner)
+    return r, pick_marked(readers.bits, n, first, readers.first[r], picked), False
+
+
+@inlined
+def _read_run(bits, cell, n, c, k, first, last, count, rows, way, margin, light, manner, form, sums):
+    """Of elements that share a form."""
+    where = sums[c], bits, n, cell, first, last
+    seen0 = rows[way.row[0], margin - way.move[0] :]
+    seen1 = rows[way.row[1], margin - way.move[1] :] if count > 1 else seen0
+    seen2 = rows[way.row[2], margin - way.move[2] :] if count > 2 else seen0
+    of_rays = form[0], form[BLOCK], form[2 * BLOCK]
+    add_terms(*where, *of_rays, form[3 * BLOCK], seen0, seen1, seen2, light.source[k, c])
+    if manner.sloped:
+        slope0, slope1, slope2 = light.slopes[0][k, c], light.slopes[1][k, c], light.slopes[2][k, c]
+        add_terms(*where, form[4 * BLOCK], form[5 * BLOCK], form[6 * BLOCK], 0.0, slope0, slope1, slope2, slope2)
+
+
+@inlined
 def read(paths, readers, ways, n, k, c, count, way, length, margin, light, spacing, manner, work, sums):
     """Add what elements read of one direction in a plane, as the mean of free `paths` or else of hits."""
-    bits, cell, of_band, rows, form = readers.bits, readers.cell, sums[c], work.rows, work.form
-    r, end = readers.runs[k], readers.runs[k + 1]
+    rows, form, r, end = work.rows, work.form, readers.runs[k], readers.runs[k + 1]
     while r < end:
-        first = readers.first[r]
-        if shared(readers, r, c, manner):
-            last, r = readers.first[r + 1], r + 1
-            if faces_away(readers, first, ways, n):
-                continue
-            work.picked[0] = first
-            depth = readers.depth[c, r - 1]
-            forms_of(paths, readers, ways, n, c, work.picked[:1], depth, count, way, length, spacing, manner, form)
-            for number in range(count):
-                if form[number * BLOCK] != 0:
-                    seen = rows[way.row[number], margin - way.move[number] :]
-                    add_term(of_band, bits, n, cell, first, last, form[number * BLOCK], seen)
-            add_term(of_band, bits, n, cell, first, last, form[3 * BLOCK], light.source[k, c])
-            if manner.sloped:
-                for d in range(3):
-                    add_term(of_band, bits, n, cell, first, last, form[(4 + d) * BLOCK], light.slopes[d][k, c])
-            continue
-        r = next_block(readers, r, end, c, manner)
-        many = pick_marked(bits, n, first, readers.first[r], work.picked)
+        first, begins = readers.first[r], r
+        r, many, alike = _next_part(readers, r, end, ways, n, c, manner, work.picked)
+        depth = readers.depth[c, begins] if alike else -1.0
         for begun in range(0, many, BLOCK):
             picked = work.picked[begun : min(begun + BLOCK, many)]
-            forms_of(paths, readers, ways, n, c, picked, -1.0, count, way, length, spacing, manner, form)
-            _read_block(readers, c, k, picked, count, rows, way, margin, light, manner, form, work.at, sums)
+            forms_of(paths, readers, ways, n, c, picked, depth, count, way, length, spacing, manner, form)
+            if alike:
+                last = readers.first[r]
+                _read_run(readers.bits, readers.cell, n, c, k, first, last, count, rows, way, margin, light, manner, form, sums)
+            else:
+                _read_block(readers, c, k, picked, count, rows, way, margin, light, manner, form, work.at, sums)
 
 
 @compiled
@@ -342,10 +387,10 @@ def _ask_medium(readers, c, k, picked, back, here, cut_begun, manner, form, want
         m, value = picked[i], wanted[i]
         if readers.cut[m] >= 0:
             j = readers.cut[m] - cut_begun
-            here[2, j] += form[3 * BLOCK + i] * value
+            ask_cut(here, j, 0, form[3 * BLOCK + i] * value)
             if manner.sloped:
                 for a in range(3):
-                    here[3 + a, j] += form[(4 + a) * BLOCK + i] * value
+                    ask_cut(here, j, 1 + a, form[(4 + a) * BLOCK + i] * value)
             continue
         back.source[k, c, readers.cell[m]] += form[3 * BLOCK + i] * value
         if manner.sloped:
@@ -353,41 +398,47 @@ def _ask_medium(readers, c, k, picked, back, here, cut_begun, manner, form, want
                 back.slopes[a][k, c, readers.cell[m]] += form[(4 + a) * BLOCK + i] * value
 
 
-@compiled
+@inlined
+def _ask_run(bits, cell, n, c, k, first, last, count, asked, back, manner, form, wanted):
+    where, of_band = (bits, n, cell, first, last), wanted[c]
+    for number in range(count):
+        if form[number * BLOCK] != 0:
+            _ask_term(asked[number], *where, form[number * BLOCK], of_band)
+    if manner.medium:
+        _ask_term(back.source[k, c], *where, form[3 * BLOCK], of_band)
+    if manner.sloped:
+        for d in range(3):
+            _ask_term(back.slopes[d][k, c], *where, form[(4 + d) * BLOCK], of_band)
+
+
+@inlined
+def _ask_block(readers, c, k, picked, count, asked, back, cut_begun, manner, work, wanted):
+    form = work.form
+    at, of_each = work.at[: len(picked)], form[ROWS * BLOCK : ROWS * BLOCK + len(picked)]
+    take(of_each, wanted[c], picked)
+    take(at, readers.cell, picked)
+    for number in range(count):
+        _ask_each(asked[number], form[number * BLOCK :], at, of_each)
+    if manner.medium:
+        _ask_medium(readers, c, k, picked, back, work.here, cut_begun, manner, form, of_each)
+    if back.cut.shape[1]:
+        take_cut_numbers(at, readers.cut, picked)
+        _ask_each(back.cut[c], form[7 * BLOCK :], at, of_each)
+
+
+@inlined
 def ask(paths, readers, ways, n, k, c, count, way, length, back, cut_begun, spacing, manner, work, wanted):
     """The transpose of `read`: what elements ask of the rays before each segment, and of what is sent."""
-    bits, cell, of_band, asked, form = readers.bits, readers.cell, wanted[c], work.asked, work.form
-    r, end = readers.runs[k], readers.runs[k + 1]
+    asked, form, r, end = work.asked, work.form, readers.runs[k], readers.runs[k + 1]
     while r < end:
-        first = readers.first[r]
-        if shared(readers, r, c, manner):
-            last, r = readers.first[r + 1], r + 1
-            if faces_away(readers, first, ways, n):
-                continue
-            work.picked[0] = first
-            depth = readers.depth[c, r - 1] if manner.medium else 0.0
-            forms_of(paths, readers, ways, n, c, work.picked[:1], depth, count, way, length, spacing, manner, form)
-            for number in range(count):
-                if form[number * BLOCK] != 0:
-                    _ask_term(asked[number], bits, n, cell, first, last, form[number * BLOCK], of_band)
-            if manner.medium:
-                _ask_term(back.source[k, c], bits, n, cell, first, last, form[3 * BLOCK], of_band)
-            if manner.sloped:
-                for d in range(3):
-                    _ask_term(back.slopes[d][k, c], bits, n, cell, first, last, form[(4 + d) * BLOCK], of_band)
-            continue
-        r = next_block(readers, r, end, c, manner)
-        many = pick_marked(bits, n, first, readers.first[r], work.picked)
+        first, begins = readers.first[r], r
+        r, many, alike = _next_part(readers, r, end, ways, n, c, manner, work.picked)
+        depth = readers.depth[c, begins] if alike and manner.medium else -1.0
         for begun in range(0, many, BLOCK):
             picked = work.picked[begun : min(begun + BLOCK, many)]
-            forms_of(paths, readers, ways, n, c, picked, -1.0, count, way, length, spacing, manner, form)
-            at, of_each = work.at[: len(picked)], form[ROWS * BLOCK : ROWS * BLOCK + len(picked)]
-            take(of_each, of_band, picked)
-            take(at, cell, picked)
-            for number in range(count):
-                _ask_each(asked[number], form[number * BLOCK :], at, of_each)
-            if manner.medium:
-                _ask_medium(readers, c, k, picked, back, work.here, cut_begun, manner, form, of_each)
-            if back.cut.shape[1]:
-                take(at, readers.cut, picked)
-                _ask_each(back.cut[c], form[7 * BLOCK :], at, of_each)
+            forms_of(paths, readers, ways, n, c, picked, depth, count, way, length, spacing, manner, form)
+            if alike:
+                last = readers.first[r]
+                _ask_run(readers.bits, readers.cell, n, c, k, first, last, count, asked, back, manner, form, wanted)
+            else:
+                _ask_block(readers, c, k, picked, count, asked, back, cut_begun, manner, work, wanted)

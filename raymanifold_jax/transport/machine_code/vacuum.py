@@ -9,17 +9,12 @@ from __future__ import annotations
 
 from numba.extending import register_jitable
 
-from .compiling import compiled, entry
+from .compiling import compiled, entry, inlined
+from .cut import place, put_cut, take_cut, through_cut_in_vacuum
 from .evolution import most_laps
 from .paths import chords
-from .readers import BLOCK, ROWS, add_each, forms_of, pick_marked, take, tilt
-from .voxels import ghost_light, put_cut
-
-
-@register_jitable
-def place(cell, shift, size):
-    at = cell - shift
-    return at + size if at < 0 else at
+from .readers import BLOCK, ROWS, add_each, forms_of, pick_marked, take_cut_numbers, tilt
+from .voxels import light_of_ghosts
 
 
 @compiled
@@ -52,7 +47,7 @@ def _picked(reading, hits, probes, n, k, picked):
     return picked[0, :many], picked[1, :more]
 
 
-@compiled
+@inlined
 def _note_rays(readers, picked, row, shift, seen):
     """Keep the rays of one segment that readers ask for: they may be other ones after it."""
     size = len(row)
@@ -67,44 +62,11 @@ def _add_to(sums, row, weight):
         sums[i] += w * row[i]
 
 
-@compiled
-def _through_cut(cells, k, number, way, row, shift, emitted, here, weight):
-    """What surfaces make of one segment in the voxels that they cut; `here`: rays, and what is summed."""
-    begun, count, size = cells.first[k], cells.first[k + 1] - cells.first[k], len(row)
-    real = row.dtype.type
-    cell, emitted = cells.cell[begun : begun + count], emitted[begun : begun + count]
-    p0, p1 = cells.plane[0, begun : begun + count], cells.plane[1, begun : begun + count]
-    p2, p3 = cells.plane[2, begun : begun + count], cells.plane[3, begun : begun + count]
-    e0, e1, e2 = real(way.begin[number, 0]), real(way.begin[number, 1]), real(way.begin[number, 2])
-    s0, s1, s2 = real(way.step[0]), real(way.step[1]), real(way.step[2])
-    share, w, tiny, zero = real(way.share[number]), real(weight), real(1e-20), real(0)
-    rays, sums = here[0, :count], here[1, :count]
-    for j in range(count):
-        rays[j] = row[place(cell[j], shift, size)]
-    for j in range(count):
-        slope = p1[j] * s0 + p2[j] * s1 + p3[j] * s2
-        g0 = p0[j] + p1[j] * e0 + p2[j] * e1 + p3[j] * e2
-        g1 = g0 + share * slope
-        free = max(min(max(g0, g1) / (abs(slope) + tiny), share), zero)
-        radiance = emitted[j] if g0 < zero else rays[j]
-        sums[j] += w * free * radiance
-        rays[j] = emitted[j] if g1 < zero else radiance
-    for j in range(count):
-        row[place(cell[j], shift, size)] = rays[j]
-
-
-@compiled
-def _from_ghosts(ghosts, k, c, n, ways, row, shift, light):
-    for j in range(ghosts.first[k], ghosts.first[k + 1]):
-        row[place(ghosts.cell[j], shift, len(row))] = ghost_light(ghosts, j, c, n, ways, light)
-
-
-@compiled
-def _take_cut(cells, k, sums, here):
-    """The sums of CUT voxels so far, where `put_cut` looks for them."""
-    begun = cells.first[k]
-    for j in range(cells.first[k + 1] - begun):
-        here[1, j], here[6, j] = 0.0, sums[cells.cell[begun + j]]
+@inlined
+def _from_ghosts(ghosts, k, row, shift, sent):
+    begun = ghosts.first[k]
+    for i in range(ghosts.first[k + 1] - begun):
+        row[place(ghosts.cell[begun + i], shift, len(row))] = sent[i]
 
 
 @compiled
@@ -121,7 +83,7 @@ def _add_times(total, form, seen):
         total[i] += form[i] * seen[i]
 
 
-@compiled
+@inlined
 def _read(paths, readers, picked, ways, n, count, way, seen, emitted, manner, form, at, sums):
     """Add what elements read of one direction in a plane, as the mean of free `paths` or else of hits."""
     for first in range(0, len(picked), BLOCK):
@@ -134,7 +96,7 @@ def _read(paths, readers, picked, ways, n, count, way, seen, emitted, manner, fo
         for number in range(count):
             _add_times(total, form[number * BLOCK :], seen[number, first:last])
         if paths and len(emitted):
-            take(at, readers.cut, readers_here)
+            take_cut_numbers(at, readers.cut, readers_here)
             add_each(total, form[7 * BLOCK :], emitted, at[:size])
         for i in range(size):
             sums[readers_here[i]] += total[i]
@@ -159,13 +121,13 @@ def in_vacuum(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wo
                     k = when % count if sense > 0 else count - 1 - when % count
                     summing = reading and manner.fluence and ghosts.first[k + 1] - ghosts.first[k] < size
                     sums = in_voxels[k, c] if summing else work.nowhere
-                    if summing:
-                        _take_cut(cut, k, sums, here)
+                    take_cut(cut, k, c, light, summing, sums, manner, here)
                     for b in range(len(batch)):
                         n = batch[b]
                         if ways.sense[n] != sense or when < -(ways.laps[n] - 1) * count:
                             continue
                         segments, row = chords(ways, n, when, planes.width, planes.wrap_v, way), rows[b]
+                        light_of_ghosts(ghosts, k, c, n, ways, light, work.sent)
                         of_hits, of_probes = _picked(reading, hits, probes, n, k, work.picked)
                         for number in range(segments):
                             shift[b] = _carry(row, shift[b], way.move[number], planes)
@@ -176,8 +138,8 @@ def in_vacuum(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wo
                                 ahead, weight = shift[b], ways.weight[n] * way.share[number]
                                 _add_to(sums[:ahead], row[size - ahead :], weight)
                                 _add_to(sums[ahead:], row[: size - ahead], weight)
-                            _through_cut(cut, k, number, way, row, shift[b], emitted, here, ways.weight[n])
-                            _from_ghosts(ghosts, k, c, n, ways, row, shift[b], light)
+                            through_cut_in_vacuum(cut, k, number, way, row, shift[b], here, ways.weight[n])
+                            _from_ghosts(ghosts, k, row, shift[b], work.sent)
                         if reading:
                             there = emitted, manner, form, work.at
                             _read(False, hits, of_hits, ways, n, segments, way, work.hits, *there, at_hits[c])
@@ -186,7 +148,7 @@ def in_vacuum(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wo
                         put_cut(cut, k, sums, here)
 
 
-@compiled
+@inlined
 def _number_cut(cells, k, number, way, row, shift, sent):
     """One segment through the voxels that surfaces cut."""
     size = len(row)
@@ -197,7 +159,7 @@ def _number_cut(cells, k, number, way, row, shift, sent):
             row[place(cells.cell[j], shift, size)] = sent[j]
 
 
-@compiled
+@inlined
 def _note_links(paths, readers, picked, ways, n, count, way, numbers, sent, manner, form, links, element, source, weight):
     """Add what elements of a plane see in one direction to the list of `links`, and return how long it is."""
     for first in range(0, len(picked), BLOCK):

@@ -1,11 +1,9 @@
-"""One segment of a direction's rays through a plane: the voxels that are free, those that surfaces cut, and ghosts."""
+"""One segment of a direction's rays through a plane: the voxels that are free, and ghosts."""
 
 from __future__ import annotations
 
-from numba.extending import register_jitable
-
 from .arguments import EVEN, PATCHY
-from .compiling import compiled
+from .compiling import compiled, inlined
 from .paths import attenuation, bend_of, exp, mean_of, middle_and_whole
 
 
@@ -107,45 +105,7 @@ def through_sloped(before, after, source, slopes, sums, point, step, even, depth
         sums[i] += w * (source[i] + mean * excess - bend * rise)
 
 
-@compiled
-def through_cut(cells, k, c, number, way, length, before, after, margin, light, manner, here, weight):
-    """What surfaces make of one segment in the voxels that they cut; `here`: what is sent there, and what is summed."""
-    begun, count = cells.first[k], cells.first[k + 1] - cells.first[k]
-    real = before.dtype.type
-    cell, emitted = cells.cell[begun : begun + count], light.cut[c, begun : begun + count]
-    p0, p1 = cells.plane[0, begun : begun + count], cells.plane[1, begun : begun + count]
-    p2, p3 = cells.plane[2, begun : begun + count], cells.plane[3, begun : begun + count]
-    e0, e1, e2 = real(way.begin[number, 0]), real(way.begin[number, 1]), real(way.begin[number, 2])
-    s0, s1, s2 = real(way.step[0]), real(way.step[1]), real(way.step[2])
-    share, w, tiny, zero, one, half = real(way.share[number]), real(weight), real(1e-20), real(0), real(1), real(0.5)
-    rays, sums = here[0, :count], here[1, :count]
-    for j in range(count):
-        rays[j] = before[margin - way.move[number] + cell[j]]
-    length, limit, extinction = real(length), real(manner.limit), cells.extinction[c, begun : begun + count]
-    source, a, u, v = here[2, :count], here[3, :count], here[4, :count], here[5, :count]
-    for j in range(count):
-        slope = p1[j] * s0 + p2[j] * s1 + p3[j] * s2
-        g0 = p0[j] + p1[j] * e0 + p2[j] * e1 + p3[j] * e2
-        g1 = g0 + share * slope
-        free = max(min(max(g0, g1) / (abs(slope) + tiny), share), zero)
-        start = share - free if g0 < zero else zero
-        radiance = emitted[j] if g0 < zero else rays[j]
-        tau = extinction[j] * length * free
-        time, rise = start + half * free, a[j] * s0 + u[j] * s1 + v[j] * s2
-        off = a[j] * e0 + u[j] * e1 + v[j] * e2 + rise * time
-        rise = rise * free
-        kept, excess, thick = exp(-tau), radiance - (source[j] + off), max(tau, limit)
-        thin = tau < limit
-        mean = mean_of(tau) if thin else (one - kept) / thick
-        bend = bend_of(tau) if thin else (half * (one + kept) - (one - kept) / thick) / thick
-        gone = radiance - tau * mean * excess if thin else source[j] + off + kept * excess
-        sums[j] += w * free * (source[j] + mean * excess - bend * rise)
-        rays[j] = emitted[j] if g1 < zero else gone + tau * bend * rise
-    for j in range(count):
-        after[margin + cell[j]] = rays[j]
-
-
-@compiled
+@inlined
 def through_free(planes, k, c, number, way, length, come, gone, light, manner, work, sums, weight):
     """One segment as if all voxels were free."""
     even, depth = planes.even[k, c] == EVEN, planes.depth[k, c]
@@ -169,35 +129,19 @@ def through_free(planes, k, c, number, way, length, come, gone, light, manner, w
         through_mixed(come, gone, light.source[k, c], sums, planes.extinction[k, c], path, manner.limit, w)
 
 
-@compiled
-def take_cut(cells, k, c, light, sums, manner, here):
-    """What is sent in the CUT voxels of a plane, and their sums so far."""
-    begun = cells.first[k]
-    for j in range(cells.first[k + 1] - begun):
-        cell = cells.cell[begun + j]
-        here[1, j], here[2, j], here[6, j] = 0.0, light.source[k, c, cell], sums[cell]
-        if manner.sloped:
-            here[3, j], here[4, j], here[5, j] = (
-                light.slopes[0][k, c, cell], light.slopes[1][k, c, cell], light.slopes[2][k, c, cell],
-            )  # fmt: skip
+@inlined
+def light_of_ghosts(ghosts, k, c, n, ways, light, sent):
+    """What the ghost voxels of a plane send in a direction: their surfaces' light, and what comes in through open sides."""
+    begun = ghosts.first[k]
+    for i in range(ghosts.first[k + 1] - begun):
+        sent[i] = light.ghost[c, begun + i]
+        image = ghosts.image[begun + i]
+        if light.radiance.shape[0] and image >= 0:
+            sent[i] += light.radiance[image, ways.index[n], c] * light.factor[c, begun + i]
 
 
-@compiled
-def put_cut(cells, k, sums, here):
-    begun = cells.first[k]
-    for j in range(cells.first[k + 1] - begun):
-        sums[cells.cell[begun + j]] = here[6, j] + here[1, j]
-
-
-@register_jitable
-def ghost_light(ghosts, j, c, n, ways, light):
-    """What a ghost voxel sends in a direction: its surface's light, and what comes in through an open side."""
-    if light.radiance.shape[0] == 0 or ghosts.image[j] < 0:
-        return light.ghost[c, j]
-    return light.ghost[c, j] + light.radiance[ghosts.image[j], ways.index[n], c] * light.factor[c, j]
-
-
-@compiled
-def from_ghosts(ghosts, k, c, n, ways, after, margin, light):
-    for j in range(ghosts.first[k], ghosts.first[k + 1]):
-        after[margin + ghosts.cell[j]] = ghost_light(ghosts, j, c, n, ways, light)
+@inlined
+def from_ghosts(ghosts, k, gone, sent):
+    cell = ghosts.cell[ghosts.first[k] : ghosts.first[k + 1]]
+    for i in range(len(cell)):
+        gone[cell[i]] = sent[i]
