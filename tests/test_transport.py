@@ -187,7 +187,7 @@ def test_quarter_turns_turn_the_solution(axis):
 
 @pytest.mark.slow
 def test_axes_of_unequal_length_may_be_exchanged(x64):
-    # x -> y -> z -> x on a lattice of 8 x 12 x 10 with everything in it, a sun too. Error budget: the four points of an emitter's
+    # x -> y -> z -> x on a lattice of 8 x 12 x 10 with everything in it, a sun too. Error budget: the points of an emitter's
     # patch do not turn with the scene, which leaves 2e-7 of the brightest; what is left of the iteration is below that.
     cyclic = np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
     assert_turns_along(rm.Lattice((8, 12, 10)), cyclic, rtol=2e-6, solved_to=1e-12)
