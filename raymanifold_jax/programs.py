@@ -12,7 +12,7 @@ so have those that JAX traces, and all of them on GPUs and on several devices.
 
 Like those in JAX's cache, the files are code: they are only kept in a folder that is the user's own.
 
-For this package: `program` in place of `equinox.filter_jit`; `keep_in`.
+For this package: `program` in place of `equinox.filter_jit`; `keep_in`; `is_own` and `write_whole` for other files of code.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def keep_in(directory: str | os.PathLike[str] | None, task: str = "") -> None:
         path = Path(directory) / "programs"
         try:
             path.mkdir(mode=0o700, parents=True, exist_ok=True)
-            _folder = _Folder(path, task) if _is_own(path) else None
+            _folder = _Folder(path, task) if is_own(path) else None
         except OSError:  # then JAX has no cache there either
             return
 
@@ -79,7 +79,7 @@ def _on_one_cpu() -> bool:
     return [device.platform for device in jax.devices()] == ["cpu"]
 
 
-def _is_own(path: Path) -> bool:
+def is_own(path: Path) -> bool:
     """Whether nobody else can write there."""
     status = path.stat()
     return not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
@@ -239,7 +239,7 @@ def _make(file: Path, function: Callable, tree: Any, known: list) -> Callable[[S
     try:
         counts = sum(isinstance(k, _Array) for k in known), sum(isinstance(leaf, _Result) for leaf in jax.tree.leaves(results))
         whole = *counts, pickle.dumps(results), serialize_executable.serialize(compiled)[0]
-        _write(file, zlib.compress(pickle.dumps(whole), _FAST))
+        write_whole(file, zlib.compress(pickle.dumps(whole), _FAST))
     except (OSError, ValueError, NotImplementedError, jax.errors.JaxRuntimeError, *_NAMELESS):  # a full disk, or callbacks
         pass
     return _runner(compiled, results)
@@ -257,7 +257,8 @@ def _past_the_cache() -> Iterator[None]:
         jax.config.update(setting, before)
 
 
-def _write(file: Path, content: bytes) -> None:
+def write_whole(file: Path, content: bytes) -> None:
+    """Under a temporary name first, so that a file is whole or is not there."""
     temporary = file.with_name(f".{secrets.token_hex(8)}")
     try:
         temporary.write_bytes(content)

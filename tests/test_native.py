@@ -5,8 +5,11 @@ Numbers in solids are left out: nobody reads them, and rays there are not the sa
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +23,7 @@ from raymanifold_jax.prepare import prepare
 from raymanifold_jax.transport import derivative, native
 from raymanifold_jax.transport.characteristic import Inflow
 from raymanifold_jax.transport.links import find_links
+from raymanifold_jax.transport.machine_code import kept
 from raymanifold_jax.transport.marks import mark_hits
 from raymanifold_jax.transport.sharded import plane_size
 
@@ -195,24 +199,77 @@ def test_a_plain_install_gives_the_same_light(monkeypatch):
     np.testing.assert_allclose(found.surfaces.irradiance, expected.surfaces.irradiance, rtol=0, atol=1e-7)
 
 
-def test_processes_compile_one_at_a_time():
-    fcntl = pytest.importorskip("fcntl", reason="locks of files")
-    from raymanifold_jax.transport.machine_code.compiling import entry, lock_of
+# Loops that are kept
 
-    assert entry(_twice)(1.0) == 2.0  # what numba does at first is done, and the program on disk
-    program = entry(_twice)
-    with lock_of(program).open("a") as other:
+
+_LINKS = np.array([0, 1, 1]), np.array([2, 0, 1]), np.array([0.5, 1.0, 2.0]), np.array([[1.0, 10.0, 100.0]])
+
+
+def _follow(loop: kept.Loop) -> np.ndarray:
+    got = np.zeros((1, 2))
+    loop(0, 3, *_LINKS, got)
+    return got
+
+
+@pytest.fixture
+def folder(monkeypatch, tmp_path) -> Path:
+    monkeypatch.setattr(kept, "_folder", lambda: tmp_path)
+    return tmp_path
+
+
+def test_a_loop_is_compiled_once_and_kept(monkeypatch, folder):
+    np.testing.assert_array_equal(_follow(kept.Loop("vacuum", "follow")), [[50.0, 21.0]])
+    (file,) = folder.glob("*.loop")
+    monkeypatch.setattr(kept.Loop, "_compiled", lambda *_: pytest.fail("compiled again"))
+    np.testing.assert_array_equal(_follow(kept.Loop("vacuum", "follow")), [[50.0, 21.0]])
+    monkeypatch.undo()
+    monkeypatch.setattr(kept, "_folder", lambda: folder)
+    whole = file.read_bytes()
+    file.write_bytes(whole[: len(whole) // 2])  # cut short
+    np.testing.assert_array_equal(_follow(kept.Loop("vacuum", "follow")), [[50.0, 21.0]])
+    assert kept._read(file) is not None
+    file.write_bytes(b"")
+    file.chmod(0o600)
+    folder.chmod(0o777)  # others may have written there
+    assert kept._read(file) is None
+
+
+def test_what_is_kept_needs_no_numba(folder):
+    code = f"""
+import pathlib, sys
+import numpy as np
+from raymanifold_jax.transport.machine_code import kept
+
+kept._folder = lambda: pathlib.Path({str(folder)!r})
+kept.get_ready()
+got = np.zeros((1, 2))
+kept.Loop("vacuum", "follow")(0, 1, np.array([1]), np.array([0]), np.array([0.5]), np.array([[4.0]]), got)
+print("numba" in sys.modules, got.tolist() == [[0.0, 2.0]])
+"""
+    run = lambda: subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
+    first, second = run(), run()
+    assert first.stdout.split() == ["True", "True"], first.stderr
+    assert second.stdout.split() == ["False", "True"], second.stderr
+
+
+def test_loops_take_arrays_without_gaps():
+    loop, (to, of, weight, sent) = kept.Loop("vacuum", "follow"), _LINKS
+    with pytest.raises(ValueError, match="got an array with gaps"):
+        loop(0, 3, to, of, weight, sent, np.zeros((1, 4))[:, ::2])
+
+
+def test_processes_compile_one_at_a_time(folder):
+    fcntl = pytest.importorskip("fcntl", reason="locks of files")
+    loop = kept.Loop("vacuum", "follow")
+    file = loop.file(0, 3, *_LINKS, np.zeros((1, 2)))
+    with file.with_suffix(".lock").open("a") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
-        waiting = threading.Thread(target=program, args=(1.0,))
+        waiting = threading.Thread(target=_follow, args=(loop,))
         waiting.start()
         waiting.join(2)
         waited = waiting.is_alive()
     waiting.join()
-    assert waited and program(1.0) == 2.0
-
-
-def _twice(x):
-    return 2 * x
+    assert waited and file.exists()
 
 
 def test_a_numba_that_does_not_import_is_told_and_left_alone(monkeypatch):

@@ -44,7 +44,7 @@ def installed() -> bool:
     if importlib.util.find_spec("numba") is None:
         return False
     try:
-        importlib.import_module(".machine_code", __package__)
+        importlib.import_module(".machine_code", __package__).get_ready()
     except (ImportError, RuntimeError) as problem:
         warnings.warn(f"numba cannot be used here, so sweeps take longer: {problem}", stacklevel=2)
         return False
@@ -114,7 +114,7 @@ def sweep(
     def begin(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> Callable[[], None]:
         planes, cut, hits, probes = arguments
         readers = hits, probes
-        light = _frozen(code.Light(
+        light = _contiguous(code.Light(
             source=np.zeros((1, bands, 1), real) if volume is None else _planes(volume, axis),
             slopes=tuple(_planes(np.asarray(slopes[a]), axis) if slopes else np.zeros((1, 1, 1), real) for a in AXES[axis]),
             cut=_gathered(sent, layout, line.at_cut, len(line.cut.cell)),
@@ -173,8 +173,8 @@ def unsweep(
     def begin(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> Callable[[], None]:
         planes, cut, hits, probes = arguments
         readers = hits, probes
-        wanted = _frozen(np.zeros((1, bands, 1), real) if volume is None else _planes(volume, axis))
-        of_hits, of_probes = _frozen(tuple(asked[:, r.element] for r in readers))
+        wanted = _contiguous(np.zeros((1, bands, 1), real) if volume is None else _planes(volume, axis))
+        of_hits, of_probes = _contiguous(tuple(asked[:, r.element] for r in readers))
 
         def run(part: np.ndarray):
             field = lambda there: np.zeros((line.shape[0], bands, line.area) if there else (1, 1, 1), real)
@@ -214,7 +214,7 @@ def views(
     def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
         planes, cut, hits, probes = arguments
         codes = numbers.transpose(AXES[axis]).reshape(-1).astype(np.int32)
-        listed = _frozen(tuple(codes[_flat(cells, line.area)] for cells in (cut, line.ghosts)))
+        listed = _contiguous(tuple(codes[_flat(cells, line.area)] for cells in (cut, line.ghosts)))
 
         def run(part: np.ndarray) -> list[tuple[np.ndarray, ...]]:
             work, seen = _standing(code, line, min(how.rows, len(part)), np.dtype(np.int32)), []
@@ -250,8 +250,8 @@ def follow(to: Array, of: Array, weight: Array, sent: Float[np.ndarray, "C n"], 
     """Sums over links: of `weight` times what is `sent` at `of`, in each of `count` places `to`."""
     from . import machine_code as code
 
-    links = _frozen(tuple(map(np.asarray, (to, of, weight))))
-    sent = _frozen(np.asarray(sent, float))
+    links = _contiguous(tuple(map(np.asarray, (to, of, weight))))
+    sent = _contiguous(np.asarray(sent, float))
     ends = np.linspace(0, len(links[0]), count_cores() + 1).astype(int)
 
     def run(number: int) -> np.ndarray:
@@ -281,7 +281,7 @@ def hit_bits(
     around = code.Around(*shape, padded, (i, j, k), np.array([np.asarray(g) for g in geometry]))
     first = np.searchsorted(plane[order], np.arange(shape[0] + 1))
     elements = code.Elements(first, np.asarray(face)[:, order], row[order].astype(int), column[order].astype(int))
-    known = _frozen((_ways(code, ordinates, chunk, place), around, elements, chunk, place))
+    known = _contiguous((_ways(code, ordinates, chunk, place), around, elements, chunk, place))
     found = np.zeros((ordinates.weight.shape[0], -(-ordinates.weight.shape[1] // 32), len(order)), np.uint32)
     # Directions of a chunk share words: each chunk is one core's.
     parts = [np.nonzero(chunk % count_cores() == core)[0] for core in range(count_cores())]
@@ -301,7 +301,7 @@ def _lines(manner: Any, layout: Layout, ordinates, extinction, bands: int, slope
         if line.parts:
             medium = _medium(layout, line, axis, extinction, bands, real)
             arguments = _arguments(code, layout, line, medium, axis)
-            yield axis, line, _frozen(arguments), _manner(code, manner, medium, sloped, line, real)
+            yield axis, line, _contiguous(arguments), _manner(code, manner, medium, sloped, line, real)
 
 
 def _one_after_the_other(begin: Callable[..., Callable[[], None]], lines: Iterable[tuple]) -> None:
@@ -347,7 +347,7 @@ def _standing(code, line: _Axis, directions: int, real) -> machine_code.Standing
 
 def _cut_blocks(code, line: _Axis, real) -> np.ndarray:
     most = int(np.diff(line.cut.first).max())
-    return np.zeros(-(-most // code.CUT_BLOCK) * code.CUT_BLOCK * code.CUT_ROWS, real)
+    return np.zeros(-(-most // code.BLOCK) * code.BLOCK * code.CUT_ROWS, real)
 
 
 def _of_ghosts(line: _Axis, real) -> np.ndarray:
@@ -370,15 +370,12 @@ def _arguments(code, layout: Layout, line: _Axis, medium: _Medium, axis: int) ->
     return planes, line.cut._replace(extinction=medium.cut), *readers
 
 
-def _frozen(given: T) -> T:
-    """Arrays as views that cannot be written to: numba compiles anew for every mixture of arrays that can and cannot."""
+def _contiguous(given: T) -> T:
+    """Arrays, in tuples of any depth, as C has them in memory."""
     if isinstance(given, tuple):
-        parts = [_frozen(part) for part in given]
+        parts = [_contiguous(part) for part in given]
         return type(given)(*parts) if hasattr(given, "_fields") else tuple(parts)  # pyright: ignore
-    if isinstance(given, np.ndarray):
-        given = np.ascontiguousarray(given).view()
-        given.flags.writeable = False
-    return given
+    return np.ascontiguousarray(given) if isinstance(given, np.ndarray) else given
 
 
 def _planes(field: np.ndarray, axis: int) -> np.ndarray:
@@ -452,7 +449,7 @@ def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
         for reads, bits, wanted in zip(layout.reads[axis].kinds, (own.hit_bits, own.probe_bits), (1, 0), strict=True)
     )
     parts = _shared(_by_sense(ways))
-    line = _frozen((ways, parts, shape, cut, ghosts, ~surface & ~ghost, hits, probes))
+    line = _contiguous((ways, parts, shape, cut, ghosts, ~surface & ~ghost, hits, probes))
     return _Axis(*line, at(np.nonzero(~in_ghost)[0]), at(np.nonzero(in_ghost)[0]))
 
 
@@ -463,7 +460,7 @@ def _by_sense(ways: machine_code.Ways) -> Int[np.ndarray, " N"]:
 
 def _shared(numbers: np.ndarray) -> tuple[np.ndarray, ...]:
     """Directions for each core, from all over; sorted by sense, they stay so."""
-    return tuple(part for first in range(count_cores()) if len(part := numbers[first :: count_cores()]))
+    return tuple(part.copy() for first in range(count_cores()) if len(part := numbers[first :: count_cores()]))
 
 
 def _lit(layout: Layout, line: _Axis, axis: int, inflow: Inflow | None) -> Int[np.ndarray, " n"]:
@@ -542,7 +539,7 @@ def _packed_marks(code, marked: tuple, image: np.ndarray, face: np.ndarray) -> n
     """Who reads in each direction, as bits [N, M / 8], of the readers that are `image` in the layout."""
     ways, chunk, place, words, wanted = marked
     bits = np.zeros((len(chunk), -(-len(image) // 8)), np.uint8)
-    known = _frozen((ways, words, np.uint32(wanted), chunk, place, image.astype(np.int32), face))
+    known = _contiguous((ways, words, np.uint32(wanted), chunk, place, image.astype(np.int32), face))
     code.pack(np.arange(len(chunk)), *known, bits)
     return bits
 

@@ -10,15 +10,17 @@ them at once (`readers`).
 
 Numbers of whole planes are of the fields' own type; those of elements are worked out in 64 bits.
 
-numba keeps what it has compiled, by the time stamp of the file that holds the outermost function: after a change in another
-file here, touch `evolution.py`, `vacuum.py` and `marks.py`.
+What is exported are the loops' names: numba is imported where one has to be compiled (see `kept`).
 
-Public: `forwards`, `backwards`, `in_vacuum`, `views`, `follow`, `mark`, `pack`, and the tuples that they take.
+Public: `forwards`, `backwards`, `in_vacuum`, `views`, `follow`, `mark`, `pack`, and the tuples that they take; `get_ready`.
 """
 
 from .arguments import (
+    BLOCK,
+    CUT_ROWS,
     EVEN,
     PATCHY,
+    ROWS,
     UNEVEN,
     Around,
     Cells,
@@ -32,16 +34,14 @@ from .arguments import (
     Ways,
     Work,
 )
-from .cut import BLOCK as CUT_BLOCK
-from .cut import ROWS as CUT_ROWS
-from .evolution import backwards, forwards
-from .marks import mark, pack
-from .readers import BLOCK, ROWS
-from .vacuum import follow, in_vacuum, views
+from .kept import Loop, get_ready
+
+forwards, backwards = Loop("evolution", "forwards"), Loop("evolution", "backwards")
+in_vacuum, views, follow = Loop("vacuum", "in_vacuum"), Loop("vacuum", "views"), Loop("vacuum", "follow")
+mark, pack = Loop("marks", "mark"), Loop("marks", "pack")
 
 __all__ = [
     "BLOCK",
-    "CUT_BLOCK",
     "CUT_ROWS",
     "EVEN",
     "PATCHY",
@@ -61,6 +61,7 @@ __all__ = [
     "backwards",
     "follow",
     "forwards",
+    "get_ready",
     "in_vacuum",
     "mark",
     "pack",

@@ -5,6 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 UNEVEN, EVEN, PATCHY = 0, 1, 2
+BLOCK = 128  # elements, or CUT voxels, that are worked on at a time
+ROWS = 20  # numbers of an element in a block, and of a CUT voxel
+CUT_ROWS = 16
 
 
 class Ways(NamedTuple):

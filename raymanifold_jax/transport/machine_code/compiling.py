@@ -1,58 +1,59 @@
-"""How the loops are compiled: as entries, which Python calls, and as what these are made of.
+"""How the loops are compiled, by numba: what they are made of, and each as a whole.
 
-numba keeps entries on disk. But processes that start at once would each compile the same ones, and could mix up what they
-write there: so one of them compiles, and the others wait and take what it has made.
+Imported when there is something to compile; else see `kept`.
 """
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numba
+import numpy as np
+from numba import types
 from numba.extending import register_jitable
 
-try:
-    import fcntl
-except ImportError:  # Windows, where each process compiles
-    fcntl = None
+# Without numba's reference counts, which would take longer than the work: what is allocated comes from outside. Without ways in
+# from Python or C, which take apart all the tuples and take longest to compile.
+_OPTIONS: Any = dict(
+    fastmath={"contract", "nsz"}, error_model="numpy", _nrt=False, no_cpython_wrapper=True, no_cfunc_wrapper=True
+)
 
-# Without numba's reference counts, which would take longer than the work: what is allocated comes from outside.
-_OPTIONS: Any = dict(fastmath={"contract", "nsz"}, error_model="numpy", _nrt=False, no_cfunc_wrapper=True)
-
-# Called by entries only. Numba would compile a way in from Python for each, which takes apart all the tuples.
 # Not `inlined`, as they otherwise would be where they are called by what is.
-compiled: Any = numba.njit(no_cpython_wrapper=True, forceinline=False, **_OPTIONS)  # pyright: ignore[reportCallIssue]
+compiled: Any = numba.njit(forceinline=False, **_OPTIONS)  # pyright: ignore[reportCallIssue]
 
 # Where LLVM would leave a function of its own, loops around it would not be vectorised, and what it takes would go through the
 # stack in every call: for tuples of arrays that is hundreds of numbers.
 inlined: Any = register_jitable(forceinline=True)
 
 
-def entry(function: Callable) -> Any:
-    program: Any = numba.njit(nogil=True, cache=True, **_OPTIONS)(function)
-    look_up_or_compile = program.compile
+def compile_loop(function: Callable, arguments: tuple, kinds: list[str]) -> tuple[str, list[str], bytes]:
+    """The name of `function` in its machine code for such arguments, the types of what it takes there, and the code.
 
-    def compile_alone(signature):
-        with _alone(lock_of(program)):
-            return look_up_or_compile(signature)
+    **Raises** `RuntimeError` if numba would have other than these `kinds` of arguments handed over.
+    """
+    program: Any = numba.njit(**_OPTIONS)(function)
+    signature = tuple(map(_type_of, arguments))
+    program.compile(signature)
+    library, name = program.overloads[signature].library, program.overloads[signature].fndesc.llvm_func_name
+    code = library.serialize_using_object_code()[2][0]
+    found = [_kind_of(str(argument.type)) for argument in library._final_module.get_function(name).arguments]
+    if found[2:] != kinds:
+        got, expected = " ".join(found[2:]), " ".join(kinds)
+        raise RuntimeError(f"numba {numba.__version__}: got arguments {got}, expected {expected}; use another version")
+    return name, kinds, code
 
-    program.compile = compile_alone
-    return program
+
+def _kind_of(type_of_llvm: str) -> str:
+    return "ptr" if type_of_llvm.endswith("*") else type_of_llvm
 
 
-def lock_of(program: Any) -> Path:
-    return Path(program.stats.cache_path) / f"{program.__name__}.lock"
-
-
-@contextlib.contextmanager
-def _alone(path: Path) -> Iterator[None]:
-    """Hold a lock, which the system takes back from processes that die; none where files cannot be written or locked."""
-    with contextlib.ExitStack() as held:
-        with contextlib.suppress(OSError):
-            file = held.enter_context(path.open("a"))
-            if fcntl is not None:
-                fcntl.flock(file, fcntl.LOCK_EX)
-        yield
+def _type_of(value: Any) -> Any:
+    """numba's type, the same for arrays that can and cannot be written to."""
+    if isinstance(value, np.ndarray):
+        return types.Array(numba.from_dtype(value.dtype), value.ndim, "C")
+    if isinstance(value, tuple):
+        parts = tuple(map(_type_of, value))
+        kind = type(value) if hasattr(value, "_fields") else None
+        return types.BaseTuple.from_types(parts, kind)
+    return numba.typeof(value)

@@ -11,13 +11,13 @@ from __future__ import annotations
 import numpy as np
 from numba.extending import register_jitable
 
+from .arguments import BLOCK
+from .arguments import CUT_ROWS as ROWS
 from .compiling import compiled, inlined
 from .paths import bend_of, exp, mean_of
 
-BLOCK = 128
 #: Rows of a block: rays; what is summed; source and slopes, or what is asked of them; what surfaces send, or what is asked of
 #: it; extinction; the surfaces' offset and normal; sums (or what is asked of sources and slopes) before this plane's.
-ROWS = 16
 _row = lambda number: np.uintp(number * BLOCK)
 _RAY, _SUM, _SOURCE, _A, _U, _V, _SENT, _EXTINCTION = (_row(r) for r in range(8))
 _P0, _P1, _P2, _P3 = (_row(8 + r) for r in range(4))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numba.extending import register_jitable
 
-from .compiling import compiled, entry
+from .compiling import compiled
 from .cut import back_cut, give_cut, keep_cut, put_cut, take_cut, through_cut
 from .paths import chords, join_ends, turn
 from .readers import ask, read
@@ -32,7 +32,6 @@ def begin_batch(work):
             work.free[b - most] = b
 
 
-@entry
 def forwards(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, work, at_hits, at_probes, in_voxels):
     """One coordinate evolution in the `chosen` directions along one axis; adds to the sums [C, M], [C, M2] and [K, C, P]."""
     count, bands, size = planes.even.shape[0], planes.even.shape[1], planes.height * planes.width
@@ -95,7 +94,6 @@ def _moved_back(row, to, move, planes, size):
     join_ends(to, margin, size)
 
 
-@entry
 def backwards(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_hits, of_probes, in_voxels, back):
     """The transpose of `forwards`: adds to `back` what weights of its three sums ask of what was sent."""
     count, bands, size = planes.even.shape[0], planes.even.shape[1], planes.height * planes.width

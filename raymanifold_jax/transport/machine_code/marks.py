@@ -6,7 +6,6 @@ import numpy as np
 from numba.extending import register_jitable
 
 from ..reading import BEHIND
-from .compiling import entry
 from .paths import chords
 from .readers import height_of, tilt
 
@@ -35,7 +34,6 @@ def _clean(around, elements, i, k, number, sense, way):
     return above + around.planes[3, before] * (way.begin[number, 2] + along_v) > -1e-3
 
 
-@entry
 def mark(chosen, ways, around, elements, chunk, place, way, bits):
     """Set the bits [G, words, I] of the `chosen` directions, which have a `place` in a `chunk` each."""
     for n in chosen:
@@ -59,7 +57,6 @@ def mark(chosen, ways, around, elements, chunk, place, way, bits):
                     bits[g, word, i] |= bit
 
 
-@entry
 def pack(chosen, ways, words, wanted, chunk, place, image, face, bits):
     """Set the bits [N, M / 8] of readers in the `chosen` directions: where those of their `image` in `words` [G, words, I] are
     `wanted`, and light comes from before their `face`."""

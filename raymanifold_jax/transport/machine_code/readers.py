@@ -13,14 +13,14 @@ from numba.extending import register_jitable
 
 from ..reading import BEHIND, ONWARD
 from ..slopes import THIN
+from .arguments import BLOCK, ROWS
 from .compiling import compiled, inlined
 from .cut import ask_cut
 from .paths import bend_of, exp, mean_of
 
-BLOCK = 128
 #: Rows of the array that follow the form: what it is multiplied by, how many hits or how much of paths, the elements' surfaces
 #: and those in their voxels (offset and normal), and what else their forms depend on.
-FACTOR, _TOTAL, _FACE, _PLANE, _HEIGHT, _DEPTH, ROWS = 8, 9, 10, 14, 18, 19, 20
+FACTOR, _TOTAL, _FACE, _PLANE, _HEIGHT, _DEPTH = 8, 9, 10, 14, 18, 19
 # Unsigned, because numba looks whether others are negative, and does not vectorise then.
 _row = lambda number: np.uintp(number * BLOCK)
 _O0, _O1, _O2, _O3, _O7 = _row(0), _row(1), _row(2), _row(3), _row(7)

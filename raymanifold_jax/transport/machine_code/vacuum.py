@@ -9,11 +9,12 @@ from __future__ import annotations
 
 from numba.extending import register_jitable
 
-from .compiling import compiled, entry, inlined
+from .arguments import BLOCK, ROWS
+from .compiling import compiled, inlined
 from .cut import place, put_cut, take_cut, through_cut_in_vacuum
 from .evolution import most_laps
 from .paths import chords
-from .readers import BLOCK, ROWS, add_each, forms_of, pick_marked, take_cut_numbers, tilt
+from .readers import add_each, forms_of, pick_marked, take_cut_numbers, tilt
 from .voxels import light_of_ghosts
 
 
@@ -102,7 +103,6 @@ def _read(paths, readers, picked, ways, n, count, way, seen, emitted, manner, fo
             sums[readers_here[i]] += total[i]
 
 
-@entry
 def in_vacuum(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, work, at_hits, at_probes, in_voxels):
     """As `evolution.forwards`, without a medium."""
     count, bands, size = planes.even.shape[0], planes.even.shape[1], planes.height * planes.width
@@ -182,7 +182,6 @@ def _note_links(paths, readers, picked, ways, n, count, way, numbers, sent, mann
     return links
 
 
-@entry
 def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut, of_ghosts, element, source, weight):
     """Rays that carry the number of the voxel they left, and which of these elements read (see `transport.links`).
 
@@ -222,7 +221,6 @@ def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut,
     return links
 
 
-@entry
 def follow(first, last, to, of, weight, sent, got):
     """Add the weight of links `first` to `last` times what is sent [C, n] to what is got [C, m]."""
     for c in range(sent.shape[0]):
