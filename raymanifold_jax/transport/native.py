@@ -40,7 +40,7 @@ T = TypeVar("T")
 
 @functools.cache
 def installed() -> bool:
-    """Whether the loops can be used: numba is installed, fits numpy's version, and has a place for what it compiles."""
+    """Whether the loops can be used: numba is installed, fits numpy's version, and does as expected."""
     if importlib.util.find_spec("numba") is None:
         return False
     try:

@@ -30,14 +30,17 @@ inlined: Any = register_jitable(forceinline=True)
 def compile_loop(function: Callable, arguments: tuple, kinds: list[str]) -> tuple[str, list[str], bytes]:
     """The name of `function` in its machine code for such arguments, the types of what it takes there, and the code.
 
-    **Raises** `RuntimeError` if numba would have other than these `kinds` of arguments handed over.
+    **Raises** `RuntimeError` if numba would have other than these `kinds` of arguments handed over, or does not tell.
     """
     program: Any = numba.njit(**_OPTIONS)(function)
     signature = tuple(map(_type_of, arguments))
     program.compile(signature)
-    library, name = program.overloads[signature].library, program.overloads[signature].fndesc.llvm_func_name
-    code = library.serialize_using_object_code()[2][0]
-    found = [_kind_of(str(argument.type)) for argument in library._final_module.get_function(name).arguments]
+    try:
+        library, name = program.overloads[signature].library, program.overloads[signature].fndesc.llvm_func_name
+        code = library.serialize_using_object_code()[2][0]
+        found = [_kind_of(str(argument.type)) for argument in library._final_module.get_function(name).arguments]
+    except AttributeError as problem:
+        raise RuntimeError(f"numba {numba.__version__}: {problem}; use another version") from problem
     if found[2:] != kinds:
         got, expected = " ".join(found[2:]), " ".join(kinds)
         raise RuntimeError(f"numba {numba.__version__}: got arguments {got}, expected {expected}; use another version")

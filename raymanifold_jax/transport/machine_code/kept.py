@@ -90,9 +90,14 @@ class Loop:
 
 
 def get_ready() -> None:
-    """Have what loops need at hand. **Raises** `ImportError` where nothing is kept yet and numba cannot be used."""
-    kept = next(_folder().glob(f"*-{_circumstances()}-*.loop"), None)
-    importlib.import_module("numba" if kept is None else "llvmlite.binding")
+    """Have at hand what loops need: llvmlite; where nothing is kept yet, numba, tried with a small loop.
+
+    **Raises** `ImportError` or `RuntimeError` where they cannot be used.
+    """
+    importlib.import_module("llvmlite.binding")
+    if not any(_folder().glob(f"*-{_circumstances()}-*.loop")):
+        nothing = np.zeros((1, 1))
+        Loop("vacuum", "follow")(0, 0, np.zeros(1, int), np.zeros(1, int), np.zeros(1), nothing, np.zeros((1, 1)))
 
 
 def _take_apart(value: Any, numbers: list[Any]) -> Any:
