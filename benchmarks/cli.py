@@ -170,8 +170,8 @@ def error_vs_time(
 @main.command()
 @_quick
 @click.option("--scene", "scenes", type=click.Choice(["A", "C"]), multiple=True, help="May be repeated. [default: both]")
-@_sizes("Of our solves; may be repeated. [default: 8, 16 and 32; with --quick 8]")
-@click.option("--directions", "counts", type=_at_least(9), multiple=True, metavar="N", help="[default: 50, 100 and 200]")
+@_sizes("Of our solves; may be repeated. [default: 8, 16, 24, 32 and 48; with --quick 8]")
+@click.option("--directions", "counts", type=_at_least(9), multiple=True, metavar="N", help="[default: 50, 100, 200 and 300]")
 @click.option("--seconds", type=float, default=120.0, show_default=True, help="The most Mitsuba gets for a scene and quantity.")
 @click.option("--goal", type=float, default=0.01, show_default=True, help="The rms error to reach.")
 @click.option("--out", type=_NewFile(), metavar="FILE.png", help="Draw error against time there (extra: plot).")
@@ -191,8 +191,8 @@ def peer(
     from .record import environment, write
 
     scenes = scenes or ("A", "C")
-    sizes = sizes or ((8,) if quick else (8, 16, 32))
-    counts = counts or ((50,) if quick else (50, 100, 200))
+    sizes = sizes or ((8,) if quick else (8, 16, 24, 32, 48))
+    counts = counts or ((50,) if quick else (50, 100, 200, 300))
     result = compare(scenes, sizes, counts, 5.0 if quick else seconds, goal, _tell)
     about = environment("mitsuba", "drjit")
     write(json_file, _QUESTIONS["peer"], result.ours, environment=about, mitsuba=result.curves, summary=result.summary)

@@ -5,9 +5,10 @@ The need in bytes, with V voxels (a layer of ghosts included), C bands, E surfac
     need = PROGRAM + C BAND + 4 V (GEOMETRY + C (FIELDS + cores)) + E (ELEMENT + C D) + links
 
 C D: the bits that say which directions hit an element. Without a medium there are also links from element to element (see
-`transport.links`), LINKS E D, if these are not more than MOST_LINKS. Where sweeps are XLA's (see `transport.native`), there are
-SWEEPS bytes and BUFFERS words a voxel more, and the links are twice as long on their way. The constants are for 32-bit numbers;
-with them the peaks of ring, three balls and the Cornell box at 32, 64 and 128 cubed, 1, 3 and 8 bands, come out within 15 %.
+`transport.links`), at most LINKS E D and usually half of that, if these are not more than MOST_LINKS. Where sweeps are XLA's
+(see `transport.native`), there are SWEEPS bytes and BUFFERS words a voxel more, and the links are longer on their way. The
+constants are for 32-bit numbers; with them the peaks of ring and three balls (32 to 128 cubed) and of the Cornell box (32) come
+out within 20 %, of first and of later starts.
 
 Public names: `estimate_memory`, `available_memory`, `check_memory`, `gigabytes`.
 """
@@ -16,14 +17,14 @@ import importlib.util
 import os
 from pathlib import Path
 
-PROGRAM = 540_000_000  # Python, JAX, compilation
+PROGRAM = 430_000_000  # Python, JAX, programs; a first start, which compiles them, takes 0 to 170 MB more
 SWEEPS = 150_000_000  # compilation of XLA's sweeps
 BAND = 50_000_000  # work arrays of a batch
 GEOMETRY = 30  # words a voxel: planes, the samples of the signed distance, copies turned to each axis
 FIELDS_VACUUM = 11  # words a voxel and band: sums of a sweep, fluence of sun, sky and bounces
 FIELDS_MEDIUM = 68  # the same, coefficients, source, the multigrid's, and the iteration's unknowns of many sweeps
 BUFFERS = 32  # words a voxel
-LINKS = 13  # bytes an element and direction, of which half fall on it
+LINKS = 13  # bytes an element and direction, half of which come from behind it
 MOST_LINKS = 1 << 30  # bytes: more are not made
 ELEMENT = 1000  # bytes an element: its rows in each axis's reads, position, material
 
@@ -42,10 +43,10 @@ def estimate_memory(scene_shape: Shape, bands: int, directions: int, medium: boo
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     fields = GEOMETRY + bands * ((FIELDS_MEDIUM if medium else FIELDS_VACUUM) + cores)
     links = 0 if medium else LINKS * elements * directions
-    links = links if links <= MOST_LINKS else 0
+    links = links // 2 if links <= MOST_LINKS else 0
     program = PROGRAM
     if importlib.util.find_spec("numba") is None:
-        program, fields, links = PROGRAM + SWEEPS, fields + BUFFERS, 2 * links
+        program, fields, links = PROGRAM + SWEEPS, fields + BUFFERS, 4 * links
     voxels = (nx + 2) * (ny + 2) * (nz + 2)
     return program + bands * BAND + 4 * voxels * fields + elements * (ELEMENT + bands * directions) + links
 

@@ -1,5 +1,6 @@
 """The benchmarks' command line, run as a user would, and the parts of it that can be wrong by themselves."""
 
+import importlib.util
 import json
 import subprocess
 import sys
@@ -88,19 +89,57 @@ def test_plot(tmp_path):
     assert (tmp_path / "plot.png").stat().st_size > 10_000
 
 
+def _is_installed(package: str) -> None:
+    if importlib.util.find_spec(package) is None:
+        pytest.skip(f"{package} is not installed")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("quantity", ["irradiance", "top view"])
 @pytest.mark.parametrize("scene", ["A", "C"])
 def test_peer_solves_the_same_scenes(scene, quantity):
     # Against the reference, which is by the same program with more samples. The noise of a pass is uncorrelated between 96 to
     # 1024 points, so that their mean has to be right within 1 %; a picture turned the wrong way has an rms error over 16 %.
-    pytest.importorskip("mitsuba")
+    # In a process of its own: in one with JAX's, Mitsuba's LLVM aborts.
+    _is_installed("mitsuba")
+    from benchmarks.measure import alone
     from benchmarks.mitsuba_scenes import error_curve
 
-    curve = error_curve(scene, quantity, seconds=2.0, goal=0.02)
+    curve = alone(error_curve, scene, quantity, 2.0, 0.02)
     if curve["variant"] != "llvm_ad_mono":
         pytest.skip("no LLVM")
     assert abs(curve["bias"]) < 0.01 and curve["points"][-1][1] < 0.1
+
+
+@pytest.mark.slow
+def test_pictures_of_the_peer_are_of_the_same_scene(tmp_path):
+    # Means over blocks are the reference's, with 1 or 2 % of noise; a picture turned the wrong way is 16 % off.
+    _is_installed("mitsuba")
+    from benchmarks.measure import alone
+    from benchmarks.mitsuba_scenes import picture_curve
+
+    curve = alone(picture_curve, "A", tmp_path / "halves.npy", 3.0, 0.02)
+    one, other = np.load(tmp_path / "halves.npy")
+    expected, _ = problems.top_view("A")
+    relative = problems.in_blocks((one + other) / 2) / expected - 1
+    assert np.sqrt(np.mean(relative**2)) < 0.04 and abs(relative.mean()) < 0.01
+    # What half of their difference says is their noise: it falls as one over the root of the time.
+    (early, first), (late, last) = curve["points"][1], curve["points"][-1]
+    assert last / first == pytest.approx(np.sqrt(early / late), rel=0.25)
+
+
+def test_noise_of_a_reference_in_two_halves_is_taken_out(tmp_path):
+    # A picture that is off by 1 % everywhere, beside two renderings with a noise of 5 % each.
+    from benchmarks.peer import point
+
+    noise = np.random.default_rng(1).normal(1, 0.05, (2, 64, 64))
+    one, other = 2.0 * noise
+    got = readings(np.full((64, 64), 2.02), (one + other) / 2, np.abs(one - other) / 2, np.full((64, 64), 2.0))
+    errors = {"rms": got.rms(), "reference_error": got.reference_error()}
+    record = {"seconds": {"first": 2.0, "warm": 1.0, "read": {"picture": 0.5}}, "quantities": {"picture": errors}}
+    found = point(record | {"size": 8, "directions": 50, "quadrature": "default"}, "picture")
+    assert found["rms"] == pytest.approx(0.01, rel=0.15) and got.rms() > 0.03
+    assert found["seconds"] == 1.5 and found["first"] == 2.5
 
 
 def test_readings():
