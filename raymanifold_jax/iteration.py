@@ -9,7 +9,8 @@ row of K adds up to less than 1; better is a solution of (I - K) w = 1, which ne
 bound: at albedo 0.99 it can be 100 times smaller than the error.
 
 GMRES leaves residuals of either sign, large in few places, of which max |r| F makes far too much. One sweep more for any u says
-better: if |r| <= u - K u + t (w - K w), then |x* - x| <= u + t w; here u is what diffusion makes of |r|.
+better: if |r| <= u - K u + t (w - K w), then |x* - x| <= u + t w; here u is what diffusion makes of |r|, or a few orders of
+bounces do.
 
 Public: `System`, `Certificate`, `Iteration`, `certify`.
 """
@@ -40,6 +41,7 @@ _ENOUGH = 0.5  # w - K w of at least this ends the search for w
 _SEARCH = 24  # sweeps of it at most
 _STALLED = 24  # sweeps without a new smallest residual before giving up
 _GROWN = 1e3  # times the first residual: diverged
+_ORDERS = 3  # of bounces that stand for diffusion where there is none: it is left out where bounces are gathers
 _HOPED = 0.2  # what polishing is at first taken to make of a bound: rather late than twice
 _ROUNDING = 2.0  # units in the last place by which a sweep's result may be off, of the largest radiance
 
@@ -243,17 +245,27 @@ class Iteration:
             self.spend(1)
 
     def tighten(self) -> None:
-        """One sweep more for a bound that is near the error, if the iteration ended on one that makes far too much of it."""
-        known = self.system.near is not None and self.certificate.weights is not None
-        if known and self.converged and self.residuals[-1] > 0 and math.isinf(self._tight) and self.sweeps_left >= 1:
+        """A sweep or a few for a bound that is near the error, if the iteration ended on one that makes far too much of it."""
+        known = self.certificate.weights is not None and self.sweeps_left >= self._orders
+        if known and self.converged and self.residuals[-1] > 0 and math.isinf(self._tight):
             self._look_closer()
+
+    @property
+    def _orders(self) -> int:
+        """Sweeps of a closer look: without diffusion, some orders of bounces are nearer to the error than one."""
+        return 1 if self.system.near is not None else _ORDERS
 
     def _look_closer(self) -> None:
         weights, slack = self.certificate.weights, self.certificate.slack
         assert weights is not None and slack is not None
-        u = self.system.precondition(_sizes(self.residual))
-        tight = float(_bounded(weights, slack, self.residual, u, self.system.bounce(u)[1]))
-        self.spend(1)
+        size = _sizes(self.residual)
+        u = self.system.precondition(size)
+        passed = self.system.bounce(u)[1]
+        for _ in range(self._orders - 1):
+            u = size + passed
+            passed = self.system.bounce(u)[1]
+        tight = float(_bounded(weights, slack, self.residual, u, passed))
+        self.spend(self._orders)
         self._tight = tight if math.isfinite(tight) else math.inf
         self._meter.update(self.sweeps, math.pi * self.bound, math.pi * self.target)
 

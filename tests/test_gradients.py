@@ -67,7 +67,7 @@ def random_scene(seed, fog, sides="open", lights=3):
             rm.Sky(value(2)),
             rm.Sun((*(0.4 * rng.random(2) - 0.2), -1), 3 * value(2)),
             rm.PointLight((0.15, 0.85, 0.8), value()),
-        ][:lights],
+        ][: min(lights, 2) if sides == "periodic" else lights],  # a point light has no end of images there
         rm.Boundary(across, wall, (floor, rm.OPEN)),
     )
 
