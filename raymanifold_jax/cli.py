@@ -452,10 +452,9 @@ def _cache_directory(environment: Mapping[str, str]) -> str | None:
     for variable in ("RAYMANIFOLD_CACHE", "JAX_COMPILATION_CACHE_DIR"):
         if variable in environment:
             return environment[variable] or None
-    user = environment.get("XDG_CACHE_HOME", "")
-    # A relative path has no meaning there (XDG base directory specification).
-    base = Path(user) if os.path.isabs(user) else Path("~/.cache").expanduser()
-    return str(base / "raymanifold")
+    from .programs import user_cache
+
+    return str(user_cache(environment))
 
 
 def _use_cache(task: str = "") -> str | None:

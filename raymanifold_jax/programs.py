@@ -12,7 +12,8 @@ so have those that JAX traces, and all of them on GPUs and on several devices.
 
 Like those in JAX's cache, the files are code: they are only kept in a folder that is the user's own.
 
-For this package: `program` in place of `equinox.filter_jit`; `keep_in`; `is_own` and `write_whole` for other files of code.
+For this package: `program` in place of `equinox.filter_jit`; `keep_in`; `user_cache`, `is_own` and `write_whole` for
+other files of code.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ import sys
 import threading
 import types
 import zlib
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -83,6 +84,14 @@ def is_own(path: Path) -> bool:
     """Whether nobody else can write there."""
     status = path.stat()
     return not hasattr(os, "getuid") or (status.st_uid == os.getuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH))
+
+
+def user_cache(environment: Mapping[str, str]) -> Path:
+    """The package's own folder in the user's cache directory."""
+    user = environment.get("XDG_CACHE_HOME", "")
+    # A relative path has no meaning there (XDG base directory specification).
+    base = Path(user) if os.path.isabs(user) else Path("~/.cache").expanduser()
+    return base / "raymanifold"
 
 
 def program(function: Callable[..., R]) -> Callable[..., R]:

@@ -2,8 +2,7 @@
 
 Those of a plane are worked on `BLOCK` at a time, without branches. What is needed of a block is in one array, whose rows lie
 one behind the other: row r begins at r * BLOCK, so that LLVM knows them apart (numbers to choose between are read first: else
-it sees a branch). Most of it is copied there once for all
-directions that pass the plane.
+it sees a branch). Most of it is copied there once for all directions that pass the plane.
 """
 
 from __future__ import annotations

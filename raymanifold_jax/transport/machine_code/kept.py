@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from ...programs import is_own, write_whole
+from ...programs import is_own, user_cache, write_whole
 
 try:
     import fcntl
@@ -75,7 +75,7 @@ class Loop:
         file = self.file(*arguments)
         found = _read(file)
         if found is None:
-            with alone(file):
+            with _alone(file):
                 found = _read(file) or self._compiled(form, arguments)
                 with contextlib.suppress(OSError):  # a full disk: the next process compiles as well
                     write_whole(file, zlib.compress(pickle.dumps(found), 1))
@@ -150,8 +150,7 @@ def _folder() -> Path:
         beside.mkdir(exist_ok=True)
         if os.access(beside, os.W_OK):
             return beside
-    cache = os.environ.get("XDG_CACHE_HOME", "")
-    own = Path(cache if os.path.isabs(cache) else Path("~/.cache").expanduser()) / "raymanifold" / "loops"
+    own = user_cache(os.environ) / "loops"
     with contextlib.suppress(OSError):
         own.mkdir(mode=0o700, parents=True, exist_ok=True)
     return own
@@ -193,7 +192,7 @@ def _loaded(name: str, kinds: list[str], code: bytes) -> Callable[[list], int]:
 
 
 @contextlib.contextmanager
-def alone(file: Path) -> Iterator[None]:
+def _alone(file: Path) -> Iterator[None]:
     """Hold a file's lock, which the system takes back from processes that die; none where files cannot be written or locked.
 
     Processes that start at once would each compile the same loops: so one of them does, and the others take what it has made.
