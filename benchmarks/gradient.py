@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .measure import alone
+from .alone import alone
 from .mitsuba_gradient import albedo as compared_albedo
 from .mitsuba_gradient import measure_mitsuba
 

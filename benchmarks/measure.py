@@ -4,7 +4,7 @@ The first solve compiles; those that follow do not. "compile" is the difference 
 others. Reading values out of a solution (final gathers, pictures) is timed apart, for each reader, likewise without its
 compilation.
 
-Public names: `Job`, `measure`, `run`, `alone`, `QUADRATURES`, `DEFAULT`, `PAPER`.
+Public names: `Job`, `measure`, `run`, `QUADRATURES`, `DEFAULT`, `PAPER`.
 """
 
 import math
@@ -146,12 +146,6 @@ def run(
                 yield asdict(job) | {"error": "the process died: out of memory?"}
             except (ValueError, RuntimeError, MemoryError) as error:
                 yield asdict(job) | {"error": str(error)}
-
-
-def alone(function: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
-    """function(*arguments) in a process of its own."""
-    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-        return pool.submit(function, *arguments).result()
 
 
 def _timed(function: Callable[[], Any]) -> tuple[float, Any]:

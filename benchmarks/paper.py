@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from .measure import alone
+from .alone import alone
 from .table import seconds_text
 
 ITERATIONS = {"ring": 12, "three-balls": 5}

@@ -3,6 +3,7 @@
 Public names: `environment`, `write`, `peak_memory`.
 """
 
+import functools
 import json
 import os
 import platform
@@ -14,10 +15,17 @@ from pathlib import Path
 from typing import Any
 
 from . import ROOT
+from .alone import alone
 
 
+@functools.cache
 def environment(*packages: str) -> dict[str, Any]:
     """Processor, cores, device, versions and commit; no name of the machine."""
+    # In another process: JAX, started here, would keep most of a GPU's memory from those that measure.
+    return alone(_environment, *packages)
+
+
+def _environment(*packages: str) -> dict[str, Any]:
     import jax
 
     import raymanifold_jax as rm

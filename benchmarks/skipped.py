@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from .measure import alone
+from .alone import alone
 
 PAIRS = {
     "no medium: bounces along links": "a trace of one: bounces are sweeps",

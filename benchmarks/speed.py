@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
-from .measure import alone
+from .alone import alone
 from .record import peak_memory
 
 CASES = ("vacuum", "homogeneous", "heterogeneous")

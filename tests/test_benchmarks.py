@@ -102,7 +102,7 @@ def test_peer_solves_the_same_scenes(scene, quantity):
     # 1024 points, so that their mean has to be right within 1 %; a picture turned the wrong way has an rms error over 16 %.
     # In a process of its own: in one with JAX's, Mitsuba's LLVM aborts.
     _is_installed("mitsuba")
-    from benchmarks.measure import alone
+    from benchmarks.alone import alone
     from benchmarks.mitsuba_scenes import error_curve
 
     curve = alone(error_curve, scene, quantity, 2.0, 0.02)
@@ -115,7 +115,7 @@ def test_peer_solves_the_same_scenes(scene, quantity):
 def test_pictures_of_the_peer_are_of_the_same_scene(tmp_path):
     # Means over blocks are the reference's, with 1 or 2 % of noise; a picture turned the wrong way is 16 % off.
     _is_installed("mitsuba")
-    from benchmarks.measure import alone
+    from benchmarks.alone import alone
     from benchmarks.mitsuba_scenes import picture_curve
 
     curve = alone(picture_curve, "A", tmp_path / "halves.npy", 3.0, 0.02)
