@@ -72,6 +72,8 @@ def first_flight(
         # Where emitters are as bright as the sky, one hides as much as it adds: what they are brighter counts.
         around = jnp.zeros(scene.bands) if sky is None else jnp.mean(sky_radiance(scene, quadrature.directions), axis=1)
         excess = brighter_than(scene, around)
+        if not checks.may_differ_from_zero(excess):
+            return swept
         emits = np.isin(np.arange(len(surfaces)), emitting_elements(scene, surfaces))
         alone = sky is None and (glow is None or not checks.may_differ_from_zero(glow))
         sent = Light(excess[:, surfaces.material] * emits, dark.voxels)

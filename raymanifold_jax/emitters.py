@@ -76,11 +76,15 @@ def emitted_by(scene: Scene) -> Float[Array, "C owners"]:
 
 
 def brighter_than(scene: Scene, sky: Float[Array, " C"]) -> Float[Array, "C owners"]:
-    """What they emit, less what they would if they could not be told from a sky of that radiance all around."""
+    """What they emit, less what they would if they could not be told from a sky of that radiance all around; 0 if less.
+
+    What a dark one hides of the sky is left to the sweep, which knows how much of it comes there, through fog.
+    """
     owners = [*scene.solids, *scene.boundary.sides]
     reflected = [0.0 if isinstance(albedo := getattr(o, "albedo", 0.0), Texture) else albedo for o in owners]
     absorbed = jnp.stack([1 - jnp.broadcast_to(albedo, sky.shape) for albedo in reflected], 1)
-    return emitted_by(scene) - sky[:, None] * absorbed
+    emitted = emitted_by(scene)
+    return jnp.clip(emitted - sky[:, None] * absorbed, 0.0, emitted)
 
 
 def emitting_faces(scene: Scene, surfaces: Surfaces, side: int) -> EmittingFaces:
