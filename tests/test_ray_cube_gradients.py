@@ -20,7 +20,9 @@ def random_scene(seed, fog, side):
     value = lambda *shape: 0.2 + 0.6 * rng.random(shape)
     wall = rm.Wall(value(2), value(2))
     medium = rm.Medium(value(5, 6, 7, 2), value(2), value(5, 6, 7)) if fog else None
-    lights = [rm.Sky(value(2)), rm.Sun((0.3, 0.1, -1), value(2)), rm.PointLight((0.15, 0.8, 0.9), value())]
+    lights = [rm.Sky(value(2)), rm.Sun((0.3, 0.1, -1), value(2))]
+    if side != "periodic":  # a point light has no end of images there
+        lights.append(rm.PointLight((0.15, 0.8, 0.9), value()))
     ball = rm.Solid(rm.Sphere((0.5, 0.45, 0.4), 0.2), value(2), value())
     boundary = rm.Boundary(rm.PERIODIC if side == "periodic" else wall, wall, (wall, rm.OPEN))
     return rm.Scene(rm.Lattice((5, 6, 7), 1 / 6), [ball], medium, lights, boundary)

@@ -7,7 +7,8 @@ the extinction s, the adjoints of (s, x) -> K x and (s, y) -> K'y share the form
     of K x:   x' = K'y,      s' = d<y, K x>/ds        (y the cotangent)
     of K'y:   y' = K z,      s' = d<y, K z>/ds        (z the cotangent)
 
-x holds the source's slopes too, where there are any: what they depend on is left to their maker (`slopes`).
+x holds the source's slopes too, where there are any: what they depend on is left to their maker (`slopes`). CUT voxels have
+none: those given there, and those that K' gives there, mean nothing.
 
 Public: `swept`, `unswept`, `Manner`.
 """
