@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from .solution import Solution
 
 _BRIGHT, _BRIGHT_SHARE = 0.9, 99.0  # auto exposure: this percentile of the radiance becomes this much of white
-_NEW_OBJECTS = 10_000  # between looks for garbage; Python's 700 cost a quarter of the main thread's time in a short run
+_NEW_OBJECTS = 200_000  # between looks for garbage: a short run has some 500 000, and looking at them takes .4 s of it
 _CACHED_FROM = 0.02  # seconds: programs that compile faster are not kept; the many small ones add up
 
 
@@ -64,10 +64,23 @@ def main(ctx: click.Context) -> None:
     before = gc.get_threshold()
     gc.set_threshold(_NEW_OBJECTS)
     ctx.call_on_close(lambda: gc.set_threshold(*before))
+    # Read when numpy is first imported. Its threads, for products that we have none of, wait by spinning on our cores.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+
+def _load_ahead(ctx: click.Context, name: str) -> None:
+    """Have what earlier runs compiled for such a command loaded while the rest is imported."""
+    # What is not given has no value yet, or one of click's own.
+    size, directions, pe = (ctx.params.get(option) for option in ("size", "directions", "pe"))
+    if not isinstance(pe, tuple):
+        _use_cache(f"{name} {size if isinstance(size, int) else 'own'} {directions}")
+
+
+_scene_to_solve = click.argument("scene", type=SceneName(before=_load_ahead), metavar="SCENE")
 
 
 @main.command()
-@scene_argument
+@_scene_to_solve
 @click.option(
     "--out",
     type=FileName(),
@@ -188,7 +201,7 @@ def render(
 
 
 @main.command()
-@scene_argument
+@_scene_to_solve
 @with_options(solve_options)
 @click.pass_context
 def solve(ctx: click.Context, scene: "SceneEntry", **settings: Any) -> None:
@@ -306,6 +319,7 @@ def _start(pe: tuple[int, int] | None) -> None:
         import raymanifold_jax as rm
 
         rm.pe_array(*pe)
+        _use_cache()
 
 
 def _film(views: "Mapping[str, View]", around: int | None, through: int | None, ctx: click.Context) -> "Mapping[str, View]":
@@ -321,7 +335,6 @@ def _film(views: "Mapping[str, View]", around: int | None, through: int | None, 
 
 def _build(entry: "SceneEntry", size: int, directions: int) -> "Scene":
     """The scene, if its solve fits into memory."""
-    _use_cache(f"{entry.name} {size} {directions}")
     from .memory import check_memory
 
     scene = entry.build(size)
@@ -452,7 +465,7 @@ def _cache_directory(environment: Mapping[str, str]) -> str | None:
     for variable in ("RAYMANIFOLD_CACHE", "JAX_COMPILATION_CACHE_DIR"):
         if variable in environment:
             return environment[variable] or None
-    from .programs import user_cache
+    from .program_files import user_cache
 
     return str(user_cache(environment))
 
@@ -460,7 +473,7 @@ def _cache_directory(environment: Mapping[str, str]) -> str | None:
 def _use_cache(task: str = "") -> str | None:
     """Have compiled programs kept; the directory, or None.
 
-    Whole ones too (`programs`), but in a directory of JAX's own setting, where it alone has a say.
+    Whole ones too (`program_files`), but in a directory of JAX's own setting, where it alone has a say.
     """
     directory = _cache_directory(os.environ)
     if directory is not None:
@@ -471,7 +484,7 @@ def _use_cache(task: str = "") -> str | None:
             directory = None
     import jax
 
-    from .programs import keep_in
+    from .program_files import keep_in
 
     jax.config.update("jax_compilation_cache_dir", directory)
     if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:

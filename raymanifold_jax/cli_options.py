@@ -20,9 +20,16 @@ _FEWEST_DIRECTIONS = 24  # with fewer, the six faces of the sweep get no more th
 
 
 class SceneName(click.ParamType):
+    """A scene by its name. `before(ctx, name)` is called before anything heavy is imported."""
+
     name = "scene"
 
+    def __init__(self, before: Callable[[click.Context, str], None] | None = None):
+        self._before = before
+
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> "SceneEntry":
+        if self._before is not None and ctx is not None:
+            self._before(ctx, str(value))
         from .scenes import find
 
         if str(value).lower().endswith(".toml"):
@@ -149,9 +156,11 @@ def _save(ctx: click.Context, param: click.Parameter, path: Path | None) -> Path
 
 
 scene_argument = click.argument("scene", type=SceneName(), metavar="SCENE")
+# Eager ones are read before the scene is looked for.
 lattice_options = (
     click.option(
         "--size",
+        is_eager=True,
         type=int,
         metavar="N",
         callback=checked(lambda n: n >= 4, "a whole number >= 4", "64 is quick, 128 fine"),
@@ -159,6 +168,7 @@ lattice_options = (
     ),
     click.option(
         "--directions",
+        is_eager=True,
         type=int,
         metavar="N",
         default=200,
@@ -208,6 +218,7 @@ solve_options = (
     ),
     click.option(
         "--pe",
+        is_eager=True,
         type=Elements(),
         metavar="AxB",
         help="Split the lattice over an array of A x B devices; CPUs are made virtual. [default: one device]",

@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from raymanifold_jax import programs
+from raymanifold_jax import program_files, programs
 from raymanifold_jax.operator import Light
-from raymanifold_jax.programs import keep_in, program
+from raymanifold_jax.program_files import keep_in
+from raymanifold_jax.programs import program
 
 traced = []  # once for every time that JAX traces the function
 
@@ -28,7 +29,7 @@ def weighted(light: Light, factor: float = 2.0, also=None):
 def folder(tmp_path, monkeypatch):
     """Where programs are kept for this test, which counts as part of the package; the programs are those of one process."""
     monkeypatch.setattr(programs, "_KNOWN", programs._KNOWN | {__name__})
-    monkeypatch.setattr(programs, "_on_one_cpu", lambda: True)
+    monkeypatch.setattr(program_files, "_on_one_cpu", lambda: True)
     traced.clear()
     keep_in(tmp_path)
     yield tmp_path / "programs"
@@ -94,20 +95,20 @@ def test_double_precision_is_another_program(folder, x64):
 
 def test_other_sources_or_versions_are_another_program(folder, monkeypatch):
     in_a_new_process(light())
-    monkeypatch.setattr(programs, "_circumstances", lambda: b"of another version")
+    monkeypatch.setattr(program_files, "_circumstances", lambda: b"of another version")
     assert in_a_new_process(light())[1] == 1
     assert in_a_new_process(light())[1] == 0
 
 
 def test_what_all_programs_depend_on(monkeypatch):
     """The environment of JAX and XLA, and versions."""
-    digest = programs._circumstances.__wrapped__
+    digest = program_files._circumstances.__wrapped__
     before = digest()
     assert digest() == before
     monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", "") + " ")
     changed = digest()
     assert changed != before
-    monkeypatch.setattr(jax, "__version__", "0.0.1")
+    monkeypatch.setattr(program_files, "version", lambda name: "0.0.1")
     assert digest() != changed
 
 
@@ -173,12 +174,12 @@ def test_a_folder_that_others_can_write_to_is_not_used(tmp_path):
     (tmp_path / "programs").mkdir()
     (tmp_path / "programs").chmod(0o777)
     keep_in(tmp_path)
-    assert programs._folder is None
+    assert program_files.folder() is None
     (tmp_path / "programs").chmod(0o700)
     keep_in(tmp_path)
-    assert programs._folder is not None
+    assert program_files.folder() is not None
     keep_in(None)
-    assert programs._folder is None
+    assert program_files.folder() is None
 
 
 def test_a_second_start_of_the_command_line(tmp_path):

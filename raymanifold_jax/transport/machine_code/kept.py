@@ -8,7 +8,7 @@ It is called by numba's own convention: pointers to the result and to an excepti
 arguments, tuples and arrays taken apart. An array of n dimensions is two pointers that are not used, its number of elements and
 their size, a pointer to the first, n lengths and n strides.
 
-Like programs (see `programs`), files of loops are code: they lie beside the sources, or in a folder that is the user's own.
+As those of programs (`program_files`), the files are code: they lie beside the sources, or in a folder that is the user's own.
 
 Public: `Loop`, `get_ready`.
 """
@@ -32,7 +32,7 @@ from typing import Any
 
 import numpy as np
 
-from ...programs import is_own, user_cache, write_whole
+from ...program_files import is_own, user_cache, write_whole
 
 try:
     import fcntl
