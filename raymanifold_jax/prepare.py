@@ -26,10 +26,14 @@ from .surfaces import Surfaces, find_surfaces
 
 
 class Prepared:
-    """Surfaces and layout of a geometry; `reuse` keeps what was made for some values while they stay the same."""
+    """Surfaces and layout of a geometry; `reuse` keeps what was made for some values while they stay the same.
 
-    def __init__(self, surfaces: Surfaces, layout: Layout):
+    One that is for a single solve keeps nothing: what that has no more use for is gone.
+    """
+
+    def __init__(self, surfaces: Surfaces, layout: Layout, once: bool = False):
         self.surfaces, self.layout = surfaces, layout
+        self._once = once
         self._kept: dict[Hashable, tuple[list[np.ndarray], Any, Any]] = {}
         self._partitions: dict[Mesh, Partition] = {}
 
@@ -50,7 +54,7 @@ class Prepared:
 
         `alive` is kept as well: an object whose id is part of the key.
         """
-        if checks.is_traced(values):
+        if self._once or checks.is_traced(values):
             return make()
         now = [known(jnp.asarray(leaf)) for leaf in jax.tree.leaves(values)]
         before, kept, _ = self._kept.get(key, ([], None, None))
@@ -62,9 +66,9 @@ class Prepared:
         return kept
 
 
-def prepare(scene: Scene) -> Prepared:
-    """Sample the geometry of a scene; its values are not looked at."""
+def prepare(scene: Scene, once: bool = False) -> Prepared:
+    """Sample the geometry of a scene; its values are not looked at. `once`: for a single solve."""
     # Known even while JAX traces values.
     with worked_out_now():
         surfaces = find_surfaces(scene)
-        return Prepared(surfaces, make_layout(scene, surfaces))
+        return Prepared(surfaces, make_layout(scene, surfaces), once)

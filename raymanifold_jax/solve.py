@@ -109,7 +109,7 @@ def solve(
     with meter:
         meter.start(f"solve {scene.summary()}")
         kept = prepared is not None
-        prepared = prepare(scene) if prepared is None else prepared
+        prepared = prepare(scene, once=True) if prepared is None else prepared
         surfaces = prepared.surfaces
         layout = prepared.layout_on(mesh if cube is None else None)
         with worked_out_now():
