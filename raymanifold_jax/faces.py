@@ -36,6 +36,7 @@ _FACES = 6  # faces told apart in a voxel, at most
 _INWARD = 1e-3
 _PATCH = 8  # samples a side on an element's plane
 _AT_SURFACE = 0.02  # voxels: points that were moved to the surface are on it
+_NEARLY_FLAT = 0.1  # voxels: how far a plane's distance may be off at the corners of a voxel without creases
 _CURVED = 1e-6  # voxels: surfaces further from their planes than this
 _SLIVER = 0.1  # voxel faces: patches smaller than this
 _POINTS = 1 << 16  # evaluated at once: one size, for one compilation, whose arrays fit a cache
@@ -142,12 +143,14 @@ def find_faces(field: DistanceField, voxels: Int[np.ndarray, "V 3"]) -> dict[str
     """Rows `voxel`, `normal`, `offset`, `area` (voxels squared), `centroid` (voxels, from the voxel's centre) of faces."""
     spacing = field.spacing
     center = field.lattice.lower + (voxels + 0.5) * spacing
-    normals, has_face = _distinct_normals(field, center)
     # Where the surface is smooth the distance at the centre gives the plane itself.
     own_distance, own_normal = field.gradient(center)
     foot = center - (own_distance * spacing)[:, None] * own_normal
-    smooth = (np.linalg.norm(own_normal, axis=1) > 1 - 1e-3) & (has_face.sum(1) <= 1)
-    smooth &= _slopes(field, foot, own_normal)[1]
+    smooth = (np.linalg.norm(own_normal, axis=1) > 1 - 1e-3) & _slopes(field, foot, own_normal)[1]
+    normals, has_face = np.zeros((len(center), _FACES, 3)), np.zeros((len(center), _FACES), bool)
+    (others,) = np.nonzero(~(smooth & _is_plain(field, center, own_distance, own_normal)))
+    normals[others], has_face[others] = _distinct_normals(field, center[others])
+    smooth &= has_face.sum(1) <= 1
     # A plane that passes its voxel by has no patch to be moved to.
     has_face[smooth, 0] = (np.abs(own_distance) < 0.5 * np.abs(own_normal).sum(1) + 1e-5)[smooth]
     normals[smooth, 0] = own_normal[smooth]
@@ -161,6 +164,16 @@ def find_faces(field: DistanceField, voxels: Int[np.ndarray, "V 3"]) -> dict[str
     found = {"voxel": voxels[rows[met]]} | {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     keep = found.pop("keep")
     return {key: value[keep] for key, value in found.items()}
+
+
+def _is_plain(field: DistanceField, center: np.ndarray, distance: np.ndarray, normal: np.ndarray) -> Bool[np.ndarray, " V"]:
+    """Voxels at whose corners the distance has nearly the slope of their centre's plane, and its values: no crease is near."""
+    corner = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    there, slope = field.gradient(center[:, None] + corner * field.spacing)
+    alike = np.einsum("vci,vi->vc", slope, normal) > _SAME_FACE
+    unit = np.abs(np.linalg.norm(slope, axis=-1) - 1) < 1e-3
+    near = np.abs(there - distance[:, None] - normal @ corner.T) < _NEARLY_FLAT
+    return (alike & unit & near).all(1)
 
 
 def _distinct_normals(field: DistanceField, center: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
