@@ -14,10 +14,12 @@ Public: `ElementTable`, `element_table`, `slopes`, `interpolate_irradiance`.
 from __future__ import annotations
 
 import itertools
+import math
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float, Int
 
 from .arrays import as_jax, real_dtype
@@ -78,7 +80,9 @@ def slopes(scene: Scene, table: ElementTable, values: Float[Array, "E C"]) -> Fl
 
 def _slopes(context, u: Array, normal: Array) -> Array:
     scene, table, values = context
-    element, arm, facing = _neighbours(scene, table, u, normal)
+    ahead = lambda vectors: tuple(vectors[:, axis, None] for axis in range(3))
+    element, arms, facing = _seen(scene, table, _members(scene, table, u), ahead(u), ahead(normal))
+    arm = jnp.stack(arms, -1)
     weight = facing * jnp.maximum(1.0 - jnp.sum(arm**2, -1) / 5.0, 0.0)
     total = jnp.maximum(weight.sum(1), 1e-20)
     around = values[element]
@@ -111,32 +115,50 @@ def interpolate_irradiance(
     normal: Float[Array, "n 3"],
 ) -> Float[Array, "n C"]:
     """Irradiance at surface points in voxel coordinates (module docstring). 0 where no element is near."""
-    element, arm, facing = _neighbours(scene, table, u, normal)
-    squared = jnp.sum(arm**2, -1)
-    reach = jnp.prod(jnp.maximum(1.0 - jnp.abs(arm), 0.0), -1) + _LEAST / (0.1 + squared) ** 3
-    weight = facing * reach
-    weight = weight / jnp.maximum(weight.sum(1, keepdims=True), 1e-30)
-    near = values[element]
-    there = near - jnp.einsum("nkci,nki->nkc", slope[element], arm)
-    result = jnp.einsum("nk,nkc->nc", weight, there)
-    around = (facing > 0.1)[..., None] & (squared < 6.0)[..., None]
-    low = jnp.min(jnp.where(around, near, jnp.inf), 1)
-    high = jnp.max(jnp.where(around, near, -jnp.inf), 1)
+    members = _members(scene, table, u).T
+    # One neighbour after the other: XLA takes a fifth longer for all at once.
+    nothing = jnp.zeros((len(u), values.shape[1]), u.dtype)
+
+    def add(number, state):
+        weights, total, low, high = state
+        element, (x, y, z), facing = _seen(scene, table, members[number], tuple(u.T), tuple(normal.T))
+        squared = x**2 + y**2 + z**2
+        overlap = (jnp.maximum(1.0 - jnp.abs(arm), 0.0) for arm in (x, y, z))
+        weight = (facing * (math.prod(overlap) + _LEAST / (0.1 + squared) ** 3))[:, None]
+        own, rise = values[element], slope[element]
+        there = own - sum(rise[..., axis] * arm[:, None] for axis, arm in enumerate((x, y, z)))
+        around = ((facing > 0.1) & (squared < 6.0))[:, None]
+        low = jnp.minimum(low, jnp.where(around, own, jnp.inf))
+        high = jnp.maximum(high, jnp.where(around, own, -jnp.inf))
+        return weights + weight, total + weight * there, low, high
+
+    begin = nothing[:, :1], nothing, nothing + jnp.inf, nothing - jnp.inf
+    weights, total, low, high = lax.fori_loop(0, len(members), add, begin)
+    result = total / jnp.maximum(weights, 1e-30)
     margin = _BEYOND * (high - low)
     result = jnp.where(high >= low, jnp.clip(result, low - margin, high + margin), result)
     return jnp.maximum(result, 0.0)
 
 
-def _neighbours(scene: Scene, table: ElementTable, u: Array, normal: Array) -> tuple[Array, Array, Array]:
-    """Elements in the voxels around points: index (n, k), x_e - x (n, k, 3), and how much they face the same way."""
+def _members(scene: Scene, table: ElementTable, u: Array) -> Int[Array, "n K"]:
+    """The elements in the voxels around points; -1: none."""
     shape = np.asarray(scene.lattice.shape)
     home = jnp.clip(jnp.floor(u).astype(jnp.int32), 0, shape - 1)
-    member = table.around[table.row[home @ np.array([shape[1] * shape[2], shape[2], 1])]]
+    return table.around[table.row[home @ np.array([shape[1] * shape[2], shape[2], 1])]]
+
+
+def _seen(
+    scene: Scene, table: ElementTable, member: Array, u: tuple[Array, ...], normal: tuple[Array, ...]
+) -> tuple[Array, tuple[Array, ...], Array]:
+    """Of members: the element, x_e - x by coordinates, and how much it faces the same way. `u`, `normal`: of their points."""
     element = jnp.maximum(member, 0)
-    arm = table.position[element] - u[:, None]
-    for axis in range(3):
-        if scene.boundary.sides[2 * axis] is PERIODIC:
-            n = shape[axis]
-            arm = arm.at[..., axis].add(-n * jnp.round(arm[..., axis] / n))
-    cosine = jnp.einsum("nki,ni->nk", table.normal[element], normal)
-    return element, arm, jnp.where(member >= 0, jnp.maximum(cosine, 0.0) ** 4 + _LEAST, 0.0)
+    position, outward = table.position[element], table.normal[element]
+    arms = []
+    for axis, kind in enumerate(scene.boundary.sides[::2]):
+        arm = position[..., axis] - u[axis]
+        if kind is PERIODIC:
+            n = scene.lattice.shape[axis]
+            arm = arm - n * jnp.round(arm / n)
+        arms.append(arm)
+    cosine = sum(outward[..., axis] * n for axis, n in enumerate(normal))
+    return element, tuple(arms), jnp.where(member >= 0, jnp.maximum(cosine, 0.0) ** 4 + _LEAST, 0.0)
