@@ -307,11 +307,21 @@ def _sun_light(scene: Scene, points: Array, normals: Array | None) -> Float[Arra
                     share = jnp.where(direction[axis] == 0, 0.0, share)
             travel = direction * sign
             back = jnp.broadcast_to(-travel, points.shape)
-            lit = _sunlit(scene, points, back, -direction) * share
-            if normals is not None:
-                lit = lit * jnp.maximum(-(normals @ travel), 0.0)[:, None]
+            if normals is None:
+                lit = _sunlit(scene, points, back, -direction) * share
+            else:
+                cosine = jnp.maximum(-(normals @ travel), 0.0)[:, None]
+                # Rays from surfaces that face away start where they meet nothing, and take no time.
+                start = jnp.where(cosine > 0, points, _beyond(scene, -travel))
+                lit = _sunlit(scene, start, back, -direction) * share * cosine
             total = total + lit * jnp.broadcast_to(sun.irradiance, (scene.bands,)).astype(points.dtype)
     return total
+
+
+def _beyond(scene: Scene, direction: Array) -> Float[Array, " 3"]:
+    """A point that has the lattice behind it, seen along a direction."""
+    lower, upper = (jnp.asarray(corner, direction.dtype) for corner in (scene.lattice.lower, scene.lattice.upper))
+    return (lower + upper) / 2 + 2 * jnp.linalg.norm(upper - lower) * direction
 
 
 def _sunlit(scene: Scene, points: Array, back: Array, towards: Array) -> Float[Array, "n C"]:
