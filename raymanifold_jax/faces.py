@@ -2,8 +2,8 @@
 
 A surface that is smooth in a voxel has one face there: the plane through the middle of its patch. Past a crease there is one
 for each side of it. In voxels, from the voxel's centre c, a face is the plane n . (x - c) + offset = 0. Samples of the voxel,
-moved to the surface by x <- x - f(x) grad f(x), tell how many normals it has; points on the planes tell how much of them is
-surface.
+moved to the surface by x <- x - f(x) grad f(x), tell how many normals it has, where its corners leave that open; points on the
+planes tell how much of them is surface.
 
 Distances and slopes are what takes time. They are evaluated many points at once, of the points that count, by one program each.
 
@@ -148,8 +148,9 @@ def find_faces(field: DistanceField, voxels: Int[np.ndarray, "V 3"]) -> dict[str
     foot = center - (own_distance * spacing)[:, None] * own_normal
     smooth = (np.linalg.norm(own_normal, axis=1) > 1 - 1e-3) & _slopes(field, foot, own_normal)[1]
     normals, has_face = np.zeros((len(center), _FACES, 3)), np.zeros((len(center), _FACES), bool)
-    (others,) = np.nonzero(~(smooth & _is_plain(field, center, own_distance, own_normal)))
-    normals[others], has_face[others] = _distinct_normals(field, center[others])
+    plain = smooth.copy()
+    plain[smooth] = _are_plain(field, center[smooth], own_distance[smooth], own_normal[smooth])
+    normals[~plain], has_face[~plain] = _distinct_normals(field, center[~plain])
     smooth &= has_face.sum(1) <= 1
     # A plane that passes its voxel by has no patch to be moved to.
     has_face[smooth, 0] = (np.abs(own_distance) < 0.5 * np.abs(own_normal).sum(1) + 1e-5)[smooth]
@@ -166,8 +167,9 @@ def find_faces(field: DistanceField, voxels: Int[np.ndarray, "V 3"]) -> dict[str
     return {key: value[keep] for key, value in found.items()}
 
 
-def _is_plain(field: DistanceField, center: np.ndarray, distance: np.ndarray, normal: np.ndarray) -> Bool[np.ndarray, " V"]:
-    """Voxels at whose corners the distance has nearly the slope of their centre's plane, and its values: no crease is near."""
+def _are_plain(field: DistanceField, center: np.ndarray, distance: np.ndarray, normal: np.ndarray) -> Bool[np.ndarray, " V"]:
+    """Whether at a voxel's corners the distance has nearly the slope of the plane at its centre, and its values: no crease is
+    near."""
     corner = np.stack(np.meshgrid(*[(-0.5, 0.5)] * 3, indexing="ij"), -1).reshape(-1, 3)
     there, slope = field.gradient(center[:, None] + corner * field.spacing)
     alike = np.einsum("vci,vi->vc", slope, normal) > _SAME_FACE
