@@ -8,16 +8,15 @@ Public names: `Job`, `measure`, `run`, `QUADRATURES`, `DEFAULT`, `PAPER`.
 """
 
 import math
-import multiprocessing
 import statistics
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
+from .alone import alone
 from .record import peak_memory
 
 if TYPE_CHECKING:
@@ -138,14 +137,13 @@ def run(
     """
     for job in jobs:
         tell(f"{job.problem}, {job.size} voxels, {job.directions} directions ({job.quadrature})")
-        # Spawned, because a fork of a process in which JAX runs can hang.
-        with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
-            try:
-                yield pool.submit(measure, job, dict(more.get(job.problem, {}))).result()
-            except BrokenProcessPool:
-                yield asdict(job) | {"error": "the process died: out of memory?"}
-            except (ValueError, RuntimeError, MemoryError) as error:
-                yield asdict(job) | {"error": str(error)}
+        try:
+            record = alone(measure, job, dict(more.get(job.problem, {})))
+        except BrokenProcessPool:
+            record = asdict(job) | {"error": "the process died: out of memory?"}
+        except (ValueError, RuntimeError, MemoryError) as error:
+            record = asdict(job) | {"error": str(error)}
+        yield record
 
 
 def _timed(function: Callable[[], Any]) -> tuple[float, Any]:

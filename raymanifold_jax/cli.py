@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from .solution import Solution
 
 _BRIGHT, _BRIGHT_SHARE = 0.9, 99.0  # auto exposure: this percentile of the radiance becomes this much of white
-_NEW_OBJECTS = 200_000  # between looks for garbage: a short run has some 500 000, and looking at them takes .4 s of it
+_NEW_OBJECTS = 200_000  # between looks for garbage: a short run has some 500 000, and looking at all of them again takes time
 _CACHED_FROM = 0.02  # seconds: programs that compile faster are not kept; the many small ones add up
 
 

@@ -83,11 +83,11 @@ def _circumstances() -> bytes:
     """A digest of what all programs depend on."""
     versions = [platform.python_version(), *map(version, VERSIONED)]
     settings = sorted(item for item in os.environ.items() if item[0].startswith(("JAX_", "XLA_")))
-    digest = hashlib.sha256(repr((versions, settings, _processor(), os.cpu_count())).encode())
+    found = hashlib.sha256(repr((versions, settings, _processor(), os.cpu_count())).encode())
     package = Path(__file__).parent
     for source in sorted(package.rglob("*.py")):
-        digest.update(repr(source.relative_to(package)).encode() + source.read_bytes())
-    return digest.digest()
+        found.update(repr(source.relative_to(package)).encode() + source.read_bytes())
+    return found.digest()
 
 
 def _processor() -> list[str]:

@@ -212,7 +212,7 @@ def test_infinite_grey_plates(row, side, width):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("emission", "rtol"), [(0.0, 2e-5), (0.1, 2e-3)])
+@pytest.mark.parametrize(("emission", "rtol"), [(0.0, 2e-5), (0.1, 1e-3)])
 def test_mirror_is_half_of_the_doubled_scene(emission, rtol):
     # Half a box with a ball, a medium and a half sky, mirrored at x = 0, against both halves together. Directions: half
     # of a set and its mirror image. Error budget: float32 rounding; emitters are cut into patches from each scene's middle.
@@ -233,7 +233,7 @@ def test_mirror_is_half_of_the_doubled_scene(emission, rtol):
         both,
         rtol=1e-4,
     )
-    np.testing.assert_allclose(doubled.fluence[:4][::-1], doubled.fluence[4:], rtol=rtol)
+    np.testing.assert_allclose(doubled.fluence[:4][::-1], doubled.fluence[4:], rtol=2e-5)
     np.testing.assert_allclose(single.fluence, doubled.fluence[4:], rtol=rtol)
 
 
