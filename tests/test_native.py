@@ -101,7 +101,7 @@ def _close(found, expected, free: np.ndarray) -> None:
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-12 * float(jnp.abs(b).max()))
 
 
-_QUICK = {"vacuum", "vacuum around two axes", "thin fog", "thick uneven fog in two bands"}
+_QUICK = {"vacuum", "thin fog", "thick uneven fog in two bands"}
 _EACH = pytest.mark.parametrize("name", [n if n in _QUICK else pytest.param(n, marks=pytest.mark.slow) for n in _SCENES])
 
 

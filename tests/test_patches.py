@@ -67,7 +67,7 @@ _ABSORBER = rm.Medium(0.0, 0.7)
 @pytest.mark.parametrize(
     ("kind", "medium"),
     [
-        pytest.param("lamp", None, id="lamp-vacuum"),
+        pytest.param("lamp", None, id="lamp-vacuum", marks=pytest.mark.slow),
         pytest.param("point", _ABSORBER, id="point-absorber"),
         pytest.param("lamp", _ABSORBER, id="lamp-absorber", marks=pytest.mark.slow),
         pytest.param("point", None, id="point-vacuum", marks=pytest.mark.slow),
