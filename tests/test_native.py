@@ -202,12 +202,12 @@ def test_a_plain_install_gives_the_same_light(monkeypatch):
 # Loops that are kept
 
 
-_LINKS = np.array([0, 1, 1]), np.array([2, 0, 1]), np.array([0.5, 1.0, 2.0]), np.array([[1.0, 10.0, 100.0]])
+_LINKS = np.array([0, 1, 3]), np.array([2, 0, 1]), np.array([0.5, 1.0, 2.0]), np.array([[1.0, 10.0, 100.0]])
 
 
 def _follow(loop: kept.Loop) -> np.ndarray:
     got = np.zeros((1, 2))
-    loop(0, 3, *_LINKS, got)
+    loop(0, 2, *_LINKS, got)
     return got
 
 
@@ -243,7 +243,7 @@ from raymanifold_jax.transport.machine_code import kept
 kept._folder = lambda: pathlib.Path({str(folder)!r})
 kept.get_ready()
 got = np.zeros((1, 2))
-kept.Loop("vacuum", "follow")(0, 1, np.array([1]), np.array([0]), np.array([0.5]), np.array([[4.0]]), got)
+kept.Loop("vacuum", "follow")(0, 2, np.array([0, 0, 1]), np.array([0]), np.array([0.5]), np.array([[4.0]]), got)
 print("numba" in sys.modules, got.tolist() == [[0.0, 2.0]])
 """
     run = lambda: subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=300)
@@ -253,15 +253,15 @@ print("numba" in sys.modules, got.tolist() == [[0.0, 2.0]])
 
 
 def test_loops_take_arrays_without_gaps():
-    loop, (to, of, weight, sent) = kept.Loop("vacuum", "follow"), _LINKS
+    loop = kept.Loop("vacuum", "follow")
     with pytest.raises(ValueError, match="got an array with gaps"):
-        loop(0, 3, to, of, weight, sent, np.zeros((1, 4))[:, ::2])
+        loop(0, 2, *_LINKS, np.zeros((1, 4))[:, ::2])
 
 
 def test_processes_compile_one_at_a_time(folder):
     fcntl = pytest.importorskip("fcntl", reason="locks of files")
     loop = kept.Loop("vacuum", "follow")
-    file = loop.file(0, 3, *_LINKS, np.zeros((1, 2)))
+    file = loop.file(0, 2, *_LINKS, np.zeros((1, 2)))
     with file.with_suffix(".lock").open("a") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
         waiting = threading.Thread(target=_follow, args=(loop,))

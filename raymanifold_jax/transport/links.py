@@ -45,11 +45,15 @@ class _Rows(eqx.Module):
 
 
 class _List(eqx.Module):
-    """The links one by one: found by machine code, and followed by it where numbers are known."""
+    """The links one by one, element by element: found by machine code, and followed by it where numbers are known."""
 
-    element: Int[Array, " L"]
+    first: Int[Array, " E1"]
     source: Int[Array, " L"]
     weight: Float[Array, " L"]
+
+    @property
+    def parts(self) -> tuple[Array, Array, Array]:
+        return self.first, self.source, self.weight
 
 
 class Links(eqx.Module):
@@ -69,13 +73,12 @@ class Links(eqx.Module):
             return _arriving(self, exitance)
         share, number, element = np.asarray(self.share), np.asarray(self.number), np.asarray(self.element)
         voxels = [np.bincount(number, band[element] * share, self.numbers) for band in np.asarray(exitance)]
-        found = native.follow(self.rows.element, self.rows.source, self.rows.weight, np.array(voxels), self.elements)
-        return as_jax(found, exitance.dtype)
+        return as_jax(native.follow(self.rows.parts, np.array(voxels)), exitance.dtype)
 
     def sent(self, asked: Float[Array, "C E"]) -> Float[Array, "C E"]:
         """The transpose of `arriving`."""
         if isinstance(self.rows, _List) and native.at_hand((self.rows, asked)):
-            voxels = native.follow(self.rows.source, self.rows.element, self.rows.weight, np.asarray(asked), self.numbers)
+            voxels = native.retrace(self.rows.parts, np.asarray(asked), self.numbers)
             share, number, element = np.asarray(self.share), np.asarray(self.number), np.asarray(self.element)
             found = [np.bincount(element, band[number] * share, self.elements) for band in voxels]
             return as_jax(np.array(found), asked.dtype)
@@ -90,7 +93,9 @@ def _arriving(links: Links, exitance: Float[Array, "C E"]) -> Float[Array, "C E"
     voxels = voxels.at[:, links.number].add(exitance[:, links.element] * links.share)
     sums = jnp.zeros((bands, links.elements), exitance.dtype)
     if isinstance(links.rows, _List):
-        return sums.at[:, links.rows.element].add(links.rows.weight * voxels[:, links.rows.source])
+        first, source, weight = links.rows.parts
+        element = jnp.repeat(np.arange(links.elements), jnp.diff(first), total_repeat_length=len(source))
+        return sums.at[:, element].add(weight * voxels[:, source], indices_are_sorted=True)
     for rows in links.rows:
 
         def add(total, link):

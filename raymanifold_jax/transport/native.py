@@ -6,7 +6,7 @@ directions and extinction are. Each core takes some of the directions through al
 This serves known numbers of one device that is a CPU, where numba is installed; all else is left to `characteristic`, which
 gives the same results to rounding.
 
-Public: `installed`, `serves`, `at_hand`, `sweep`, `unsweep`, `views`, `follow`, `hit_bits`.
+Public: `installed`, `serves`, `at_hand`, `sweep`, `unsweep`, `views`, `follow`, `retrace`, `hit_bits`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import functools
 import importlib
 import importlib.util
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
@@ -202,14 +202,21 @@ def unsweep(
     return as_jax(exitance, real), source, tuple(map(as_jax, fields[1:])) if sloped else None
 
 
-def views(
-    layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray
-) -> tuple[Int[np.ndarray, " L"], Int[np.ndarray, " L"], Float[np.ndarray, " L"]]:
-    """In vacuum, what elements see of voxels that send the `numbers` [X, Y, Z], 1 and up: element, number and weight."""
+class Listed(NamedTuple):
+    """Links of elements in vacuum, those of the same element together: which are whose, what sends, and weights."""
+
+    first: Int[np.ndarray, " E1"]
+    source: Int[np.ndarray, " L"]
+    weight: Float[np.ndarray, " L"]
+
+
+def views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray) -> Listed:
+    """In vacuum, what elements see of voxels that send the `numbers` [X, Y, Z], 1 and up."""
     from . import machine_code as code
     from .derivative import Manner
 
-    real, found = np.dtype(layout.plane.dtype), []
+    real = np.dtype(layout.plane.dtype)
+    found: list[list[tuple[np.ndarray, ...]]] = [[] for _ in range(count_cores())]
 
     def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
         planes, cut, hits, probes = arguments
@@ -228,14 +235,37 @@ def views(
                 seen.append(tuple(values[:count].copy() for values in lists))
             return seen
 
-        for seen in on_cores(run, line.parts):
-            found.extend(seen)
+        for of_core, seen in zip(found, on_cores(run, line.parts), strict=False):
+            of_core.extend(seen)
 
     for line in _lines(Manner(False), layout, ordinates, None, 1, False, real):
         along(*line)
-    none = np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros(0, real)
-    element, source, weight = (np.concatenate(values) for values in zip(none, *found, strict=True))
-    return element, source, weight
+    return _sorted(found, layout.elements, real)
+
+
+def _sorted(parts: list[list[tuple[np.ndarray, ...]]], elements: int, real: np.dtype) -> Listed:
+    """Lists of element, source and weight, some for each core, as one."""
+    from . import machine_code as code
+
+    def tally(part: list[tuple[np.ndarray, ...]]) -> np.ndarray:
+        count = np.zeros(elements, np.int32)
+        for element, _, _ in part:
+            code.tally(element, count)
+        return count
+
+    counts = np.array(list(on_cores(tally, parts)))
+    first = np.zeros(elements + 1, np.int32)
+    np.cumsum(counts.sum(0), out=first[1:])
+    # A core's links of an element come after those of the cores before.
+    places = _contiguous(tuple((first[:-1] + np.cumsum(counts, 0) - counts).astype(np.int32)))
+    source, weight = np.empty(first[-1], np.int32), np.empty(first[-1], real)
+
+    def sort(core: int) -> None:
+        for links in parts[core]:
+            code.sort(*links, places[core], source, weight)
+
+    list(on_cores(sort, range(len(parts))))
+    return Listed(first, source, weight)
 
 
 def at_hand(arrays: Any) -> bool:
@@ -246,20 +276,36 @@ def at_hand(arrays: Any) -> bool:
     return all(d.platform == "cpu" for a in leaves if isinstance(a, jax.Array) for d in a.devices())
 
 
-def follow(to: Array, of: Array, weight: Array, sent: Float[np.ndarray, "C n"], count: int) -> Float[np.ndarray, "C m"]:
-    """Sums over links: of `weight` times what is `sent` at `of`, in each of `count` places `to`."""
+def follow(links: Sequence[Array], sent: Float[np.ndarray, "C n"]) -> Float[np.ndarray, "C E"]:
+    """What arrives at elements by their links (`Listed`) of what is `sent`."""
     from . import machine_code as code
 
-    links = _contiguous(tuple(map(np.asarray, (to, of, weight))))
+    known, ends = _of_links(links)
     sent = _contiguous(np.asarray(sent, float))
-    ends = np.linspace(0, len(links[0]), count_cores() + 1).astype(int)
+    got = np.zeros((len(sent), len(known.first) - 1))
+    list(on_cores(lambda n: code.follow(ends[n], ends[n + 1], *known, sent, got), range(count_cores())))
+    return got
+
+
+def retrace(links: Sequence[Array], asked: Float[np.ndarray, "C E"], count: int) -> Float[np.ndarray, "C n"]:
+    """The transpose of `follow`: of `count` numbers that send."""
+    from . import machine_code as code
+
+    known, ends = _of_links(links)
+    asked = _contiguous(np.asarray(asked, float))
 
     def run(number: int) -> np.ndarray:
-        got = np.zeros((len(sent), count))
-        code.follow(ends[number], ends[number + 1], *links, sent, got)
+        got = np.zeros((len(asked), count))
+        code.retrace(ends[number], ends[number + 1], *known, asked, got)
         return got
 
     return np.sum(list(on_cores(run, range(count_cores()))), axis=0)
+
+
+def _of_links(links: Sequence[Array]) -> tuple[Listed, np.ndarray]:
+    """As numpy's arrays, and at which elements each core begins, for all to have as many links."""
+    known = Listed(*_contiguous(tuple(map(np.asarray, links))))
+    return known, np.searchsorted(known.first, np.linspace(0, known.first[-1], count_cores() + 1).astype(int))
 
 
 def hit_bits(

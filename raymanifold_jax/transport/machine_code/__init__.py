@@ -12,7 +12,8 @@ Numbers of whole planes are of the fields' own type; those of elements are worke
 
 What is exported are the loops' names: numba is imported where one has to be compiled (see `kept`).
 
-Public: `forwards`, `backwards`, `in_vacuum`, `views`, `follow`, `mark`, `pack`, and the tuples that they take; `get_ready`.
+Public: `forwards`, `backwards`, `in_vacuum`, `views`, `tally`, `sort`, `follow`, `retrace`, `mark`, `pack`, and the tuples that
+they take; `get_ready`.
 """
 
 from .arguments import (
@@ -37,7 +38,8 @@ from .arguments import (
 from .kept import Loop, get_ready
 
 forwards, backwards = Loop("evolution", "forwards"), Loop("evolution", "backwards")
-in_vacuum, views, follow = Loop("vacuum", "in_vacuum"), Loop("vacuum", "views"), Loop("vacuum", "follow")
+in_vacuum, views = Loop("vacuum", "in_vacuum"), Loop("vacuum", "views")
+tally, sort, follow, retrace = (Loop("vacuum", name) for name in ("tally", "sort", "follow", "retrace"))
 mark, pack = Loop("marks", "mark"), Loop("marks", "pack")
 
 __all__ = [
@@ -65,5 +67,8 @@ __all__ = [
     "in_vacuum",
     "mark",
     "pack",
+    "retrace",
+    "sort",
+    "tally",
     "views",
 ]

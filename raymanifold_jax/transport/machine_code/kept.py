@@ -96,8 +96,7 @@ def get_ready() -> None:
     """
     importlib.import_module("llvmlite.binding")
     if not any(_folder().glob(f"*-{_circumstances()}-*.loop")):
-        nothing = np.zeros((1, 1))
-        Loop("vacuum", "follow")(0, 0, np.zeros(1, int), np.zeros(1, int), np.zeros(1), nothing, np.zeros((1, 1)))
+        Loop("vacuum", "tally")(np.zeros(1, np.int32), np.zeros(1, np.int32))
 
 
 def _take_apart(value: Any, numbers: list[Any]) -> Any:

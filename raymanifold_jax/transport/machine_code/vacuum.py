@@ -221,8 +221,33 @@ def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut,
     return links
 
 
-def follow(first, last, to, of, weight, sent, got):
-    """Add the weight of links `first` to `last` times what is sent [C, n] to what is got [C, m]."""
+def tally(element, count):
+    """Count the links of each element."""
+    for i in range(len(element)):
+        count[element[i]] += 1
+
+
+def sort(element, source, weight, place, to_source, to_weight):
+    """Write links to where those of their elements go: the next one's `place`."""
+    for i in range(len(element)):
+        j = place[element[i]]
+        place[element[i]] = j + 1
+        to_source[j], to_weight[j] = source[i], weight[i]
+
+
+def follow(begin, end, first, source, weight, sent, got):
+    """What is got [C, E] by the elements `begin` to `end` of what is sent [C, n]: the sum of their links' weights times it."""
     for c in range(sent.shape[0]):
-        for i in range(first, last):
-            got[c, to[i]] += weight[i] * sent[c, of[i]]
+        for e in range(begin, end):
+            total = 0.0
+            for i in range(first[e], first[e + 1]):
+                total += weight[i] * sent[c, source[i]]
+            got[c, e] = total
+
+
+def retrace(begin, end, first, source, weight, asked, got):
+    """The transpose of `follow`, added to what is got [C, n] of what is asked [C, E]."""
+    for c in range(asked.shape[0]):
+        for e in range(begin, end):
+            for i in range(first[e], first[e + 1]):
+                got[c, source[i]] += weight[i] * asked[c, e]
