@@ -149,7 +149,10 @@ def _face_points(lattice: Lattice, surfaces: Surfaces, rows: np.ndarray) -> tupl
 
 
 class Transport(eqx.Module):
-    """K without the albedos: a layout, the directions, the medium's extinction, and the sums of a uniform radiance of 1."""
+    """K without the albedos: a layout, the directions, the medium's extinction, and the sums of a uniform radiance of 1.
+
+    In vacuum all bands are alike: their sums and factors have one, for all.
+    """
 
     layout: Layout | Partition
     ordinates: tuple[Ordinates, ...]
@@ -189,8 +192,8 @@ def _balanced(factors: Light | None, leaving: Light, inflow: Inflow | None) -> t
     if factors is None:
         return leaving, inflow
     voxels = None if leaving.voxels is None or factors.voxels is None else leaving.voxels * factors.voxels
-    leaving = Light(leaving.elements * factors.elements, voxels)
-    return leaving, None if inflow is None else Inflow(inflow.radiance, factors.elements)
+    inflow = None if inflow is None else Inflow(inflow.radiance, jnp.broadcast_to(factors.elements, leaving.elements.shape))
+    return Light(leaving.elements * factors.elements, voxels), inflow
 
 
 @program
@@ -199,37 +202,30 @@ def _means(sums: Light, furnace: Light) -> Light:
     return Light(elements, None if sums.voxels is None else _ratio(sums.voxels, furnace.voxels))
 
 
-def _balance(transport: Transport, area: Float[Array, " E"]) -> Transport:
-    """The same transport with factors of what leaves that make the exchange of power balance.
+def _balance(transport: Transport, area: Float[Array, " E"], sums: Light) -> tuple[Light, Light]:
+    """Factors of what leaves that make the exchange of power balance, and the sums for them; `sums`: for light of 1.
 
     The power that a source sends should all arrive: with g = (pi A, 4 pi extinction V), the power at an element or in a
     voxel for a mean radiance of 1, the columns of K without albedos add up as sum_i g_i K_ij = g_j. Gathering makes the rows
     exact, not the columns, which are some percent off next to concave corners. Sinkhorn's iteration scales both in turn: the
     transposed sweep tells the columns' sums, the furnace the rows'.
     """
-    extinction = transport.extinction
-    power, sums = _powers(transport, area), Light(transport.element_sums)
-    if extinction is not None:
-        sums = Light(sums.elements, transport.voxel_sums)
+    vacuum, power = transport.extinction is None, _powers(transport, area)
     factors = ones_like(power)
-    for beyond in _ROUNDS_IN_VACUUM if extinction is None else _ROUNDS_IN_MEDIUM:
-        sent = _transposed(transport, jax.tree.map(_ratio, power, sums))
+    for beyond in _ROUNDS_IN_VACUUM if vacuum else _ROUNDS_IN_MEDIUM:
+        wanted = jax.tree.map(_ratio, power, Light(sums.elements) if vacuum else sums)
+        sent = _transposed(transport, wanted)
         step = as_jax(beyond, factors.elements.dtype)
         factors = jax.tree.map(partial(_factor, step), factors, power, sent)
-        if transport.links is not None:
-            sums = Light(transport.links.arriving(factors.elements))
-        else:
-            sums = _furnace(transport, factors)
-            sums = sums if extinction is not None else Light(sums.elements)
-    sums = _furnace(transport, factors) if extinction is None else sums
-    return dataclasses.replace(transport, element_sums=sums.elements, voxel_sums=sums.voxels, factors=factors)
+        sums = _sums(transport, factors)
+    return factors, sums
 
 
 @program
 def _powers(transport: Transport, area: Float[Array, " E"]) -> Light:
     """At elements and in voxels, for a mean radiance of 1."""
     layout, images = transport.layout, len(transport.layout.unfolding.images())
-    power = jnp.broadcast_to(jnp.pi * area, transport.element_sums.shape)
+    power = jnp.broadcast_to(jnp.pi * area, (len(transport.element_sums), len(area)))
     if transport.extinction is None:
         return Light(power)
     weight = sum(jnp.sum(o.weight) for o in transport.ordinates)
@@ -283,6 +279,13 @@ def _unsloped(layout: Layout | Partition, slopes: tuple[Array, ...], albedo, ext
 _count_laps = eqx.filter_jit(laps_over)
 
 
+def _sums(transport: Transport, leaving: Light) -> Light:
+    """The sums for light of 1, or in proportion to it: of elements alone where those can be had without a sweep."""
+    if transport.links is not None:
+        return Light(transport.links.arriving(leaving.elements))
+    return _furnace(transport, leaving)
+
+
 def _furnace(transport: Transport, leaving: Light) -> Light:
     """The sums at elements and, outside solids, in voxels for light of 1, or in proportion to it."""
     sums = _sweep(transport, leaving, None, True)
@@ -304,6 +307,17 @@ def _padded(layout: Layout | Partition, field: Array) -> Array:
 @program
 def _first(field: Array) -> Array:
     return field[0]
+
+
+@program
+def _one_above_the_other(one: Light, other: Light) -> Light:
+    return jax.tree.map(lambda *parts: jnp.concatenate(parts), one, other)
+
+
+@program
+def _parted(both: Light) -> tuple[Light, Light]:
+    half = len(both.elements) // 2
+    return jax.tree.map(lambda a: a[:half], both), jax.tree.map(lambda a: a[half:], both)
 
 
 @program
@@ -356,17 +370,23 @@ def _make_transport(
                 f"boundary: some rays are still going after {_MOST_LAPS} laps of a periodic axis; expected every ray to meet "
                 "a surface, an open side or an absorbing medium; close or open another side, or add absorption"
             )
-    ones = lambda *shape: as_jax(np.ones((bands, *shape), layout.plane.dtype))
-    transport = Transport(layout, ordinates, padded, ones(), ones(), ones(), thin, thick and not beam)
-    leaving = Light(ones(layout.elements), None if extinction is None else ones(*layout.shape))
-    sums = _furnace(transport, stored(layout, leaving))
-    assert sums.voxels is not None
-    fields = {"element_sums": sums.elements, "voxel_sums": sums.voxels, "coverage": _first(sums.voxels)}
-    transport = dataclasses.replace(transport, **fields)
+    ones = lambda *shape: as_jax(np.ones((1 if extinction is None else bands, *shape), layout.plane.dtype))
+    links = None
     if area is not None and extinction is None and isinstance(layout, Layout) and worth_linking(layout, len(quadrature)):
-        transport = dataclasses.replace(transport, links=find_links(layout, ordinates))
+        links = find_links(layout, ordinates)
+    transport = Transport(layout, ordinates, padded, ones(), ones(), ones(), thin, thick and not beam, links=links)
+    unit = stored(layout, Light(ones(layout.elements), None if extinction is None else ones(*layout.shape)))
+    sums = uniform = _sums(transport, unit)
     if area is not None:
-        transport = _balance(transport, as_jax(area, layout.plane.dtype))
+        if uniform.voxels is not None:
+            transport = dataclasses.replace(transport, coverage=_first(uniform.voxels))
+        factors, sums = _balance(transport, as_jax(area, layout.plane.dtype), uniform)
+        transport = dataclasses.replace(transport, factors=factors)
+        if links is not None:  # those of voxels, of both in one sweep
+            uniform, sums = _parted(_furnace(transport, _one_above_the_other(unit, factors)))
+    assert sums.voxels is not None and uniform.voxels is not None
+    fields = {"element_sums": sums.elements, "voxel_sums": sums.voxels, "coverage": _first(uniform.voxels)}
+    transport = dataclasses.replace(transport, **fields)
     if thick and albedo is not None:
         if transport.factors is not None and transport.factors.voxels is not None:
             albedo = _times(albedo, transport.factors.voxels)

@@ -148,13 +148,16 @@ def _side_elements(scene: Scene, field: DistanceField, side: int) -> dict[str, n
     offsets = np.zeros((16, 3))
     offsets[:, u], offsets[:, v] = (g.ravel() for g in np.meshgrid(grid, grid, indexing="ij"))
     face = voxel + 0.5 + 0.5 * inward
-    at = lambda depth: lattice.lower + (face[:, None] + (offsets + depth * inward)) * lattice.spacing
+    exposed, flush = np.ones((len(face), 16), bool), np.zeros((len(face), 16), bool)
     if scene.solids:
-        exposed = field.distance(at(0.01)) > 0
+        distance = field.distance(lattice.lower + face * lattice.spacing)
+        exposed &= distance[:, None] > 0
+        # No sample of a face is further from its middle.
+        near = np.abs(distance) < 0.75
+        at = lambda depth: lattice.lower + (face[near, None] + (offsets + depth * inward)) * lattice.spacing
+        exposed[near] = field.distance(at(0.01)) > 0
         # A solid that lies just behind the side shows through it, flush: a lamp in a ceiling.
-        flush = exposed & (field.distance(at(-0.01)) < 0)
-    else:
-        exposed, flush = np.ones((len(face), 16), bool), np.zeros((len(face), 16), bool)
+        flush[near] = exposed[near] & (field.distance(at(-0.01)) < 0)
     parts = []
     for member, material, is_open in (
         (exposed & ~flush, len(scene.solids) + side, kind is OPEN),
