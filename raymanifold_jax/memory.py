@@ -5,16 +5,20 @@ The need in bytes, with V voxels (a layer of ghosts included), C bands, E surfac
     need = PROGRAM + C BAND + 4 V (GEOMETRY + C (FIELDS + cores)) + E (ELEMENT + C D) + links
 
 C D: the bits that say which directions hit an element. Without a medium there are also links from element to element (see
-`transport.links`), at most LINKS E D and usually half of that, if these are not more than MOST_LINKS. Where sweeps are XLA's
-(see `transport.native`), there are SWEEPS bytes and BUFFERS words a voxel more, and the links are longer on their way. The
-constants are for 32-bit numbers; with them the peaks of ring and three balls (32 to 128 cubed) and of the Cornell box (32) come
-out within 20 %, of first and of later starts.
+`transport.links`), at most LINKS E D and usually half of that, if these are not more than MOST_LINKS. Of fields that are LARGE
+only HELD are there at a time, as what is freed is given back (`give_back_freed`). Where sweeps are XLA's (see
+`transport.native`), it is not, there are SWEEPS bytes and BUFFERS words a voxel more, and the links are longer on their way.
+The constants are for 32-bit numbers; with them the peaks of ring and three balls (32 to 160 cubed) and of the Cornell box (32)
+come out within 20 %, of first and of later starts.
 
-Public names: `estimate_memory`, `available_memory`, `check_memory`, `gigabytes`.
+Public names: `estimate_memory`, `available_memory`, `check_memory`, `give_back_freed`, `gigabytes`.
 """
 
+import ctypes
+import functools
 import importlib.util
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 PROGRAM = 430_000_000  # Python, JAX, programs; a first start, which compiles them, takes 0 to 170 MB more
@@ -26,6 +30,8 @@ FIELDS_MEDIUM = 68  # the same, coefficients, source, the multigrid's, and the i
 BUFFERS = 32  # words a voxel
 LINKS = 13  # bytes an element and direction, half of which come from behind it
 MOST_LINKS = 1 << 30  # bytes: more are not made
+LARGE = 1 << 22  # bytes of an array: smaller ones are not worth giving back
+HELD = 0.65
 ELEMENT = 1000  # bytes an element: its rows in each axis's reads, position, material
 
 Shape = tuple[int, int, int]
@@ -47,8 +53,10 @@ def estimate_memory(scene_shape: Shape, bands: int, directions: int, medium: boo
     program = PROGRAM
     if importlib.util.find_spec("numba") is None:
         program, fields, links = PROGRAM + SWEEPS, fields + BUFFERS, 4 * links
+    elif _trim() is not None and 4 * bands * nx * ny * nz >= LARGE:
+        fields *= HELD
     voxels = (nx + 2) * (ny + 2) * (nz + 2)
-    return program + bands * BAND + 4 * voxels * fields + elements * (ELEMENT + bands * directions) + links
+    return program + bands * BAND + int(4 * voxels * fields) + elements * (ELEMENT + bands * directions) + links
 
 
 def available_memory() -> int | None:
@@ -75,6 +83,25 @@ def check_memory(scene_shape: Shape, bands: int, directions: int, medium: bool, 
     advice = f"{low} voxels on the longest side would fit" if low else "free some memory, or use a larger machine"
     got = f"{' x '.join(map(str, scene_shape))} voxels, which need about {gigabytes(need)}"
     raise ValueError(f"size: got {got}, expected at most the {gigabytes(available)} available; {advice}")
+
+
+def give_back_freed(size: int) -> None:
+    """Give memory that was freed back to the system, where arrays have this `size` in bytes and it is worth its milliseconds.
+
+    The C library keeps what lies between arrays still in use, and each thread what it used: a quarter of a large solve's peak.
+    """
+    trim = _trim()
+    if trim is not None and size >= LARGE:
+        trim(0)
+
+
+@functools.cache
+def _trim() -> Callable[[int], int] | None:
+    """glibc's `malloc_trim`; None where there is another C library."""
+    try:
+        return ctypes.CDLL(None).malloc_trim
+    except (AttributeError, OSError, TypeError):
+        return None
 
 
 def gigabytes(size: float) -> str:

@@ -27,6 +27,7 @@ from .. import checks
 from ..arrays import as_jax
 from ..keep import keep
 from ..layout import AXES, Layout, Ordinates, Reads
+from ..memory import give_back_freed
 from .characteristic import Inflow
 from .cores import count_cores, on_cores, on_cpu
 from .step import thin_limit
@@ -145,6 +146,7 @@ def sweep(
         return add_up
 
     _one_after_the_other(begin, _lines(manner, layout, ordinates, extinction, bands, sloped, real))
+    give_back_freed(real.itemsize * bands * int(np.prod(layout.shape)))
     voxels = as_jax(layout.from_padded(in_voxels)) if manner.fluence else None
     return as_jax(at_elements, real), voxels
 
@@ -198,6 +200,7 @@ def unsweep(
         return add_up
 
     _one_after_the_other(begin, _lines(manner, layout, ordinates, extinction, bands, sloped, real))
+    give_back_freed(real.itemsize * bands * int(np.prod(layout.shape)))
     source = as_jax(layout.from_padded(fields[0])) if medium else None
     return as_jax(exitance, real), source, tuple(map(as_jax, fields[1:])) if sloped else None
 
