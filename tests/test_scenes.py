@@ -1,5 +1,8 @@
 """The ready-made scenes are what their sources say, and their views show them whole, upright and from outside solids."""
 
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -149,6 +152,18 @@ def test_suggested_size_fits(monkeypatch):
     memory.check_memory((side, side, side), 1, 200, medium=True)
     with pytest.raises(ValueError, match="size: got"):
         memory.check_memory((side + 1, side + 1, side + 1), 1, 200, medium=True)
+
+
+@pytest.mark.skipif(memory._trim() is None, reason="glibc")
+def test_freed_memory_is_given_back():
+    resident = lambda: int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+    blocks = [np.ones(100_000, np.uint8) for _ in range(2000)]
+    del blocks[::2]  # every other one: what lies between those in use stays with the process
+    before = resident()
+    memory.give_back_freed(memory.LARGE - 1)
+    assert resident() > before - 10_000_000
+    memory.give_back_freed(memory.LARGE)
+    assert resident() < before - 60_000_000
 
 
 @pytest.mark.parametrize("version", [1, 2])
