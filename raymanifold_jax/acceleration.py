@@ -16,8 +16,8 @@ percent of a sweep's time. With A that matrix,
 
     (I - K)^-1 = I + (I - K)^-1 K   is nearly   M = I + R A^-1 g,
 
-and a Krylov method on (I - K) M needs about as many sweeps for albedo 0.9999 as for 0.9, in thin media as in thick ones
-(diffusion synthetic acceleration as a preconditioner: Warsa, Wareing & Morel, Nucl. Sci. Eng. 147, 2004).
+and GMRES on (I - K) M needs about as many sweeps for albedo 0.9999 as for 0.9, in thin media as in thick ones (diffusion
+synthetic acceleration as a preconditioner: Warsa, Wareing & Morel, Nucl. Sci. Eng. 147, 2004).
 
 Public: `Diffusion`, `make_diffusion`.
 """
@@ -42,7 +42,7 @@ from .surfaces import Surfaces
 from .transport.slopes import flattening
 
 _FREE_PATH = 4.0  # times the distance to the nearest surface, where nothing else ends a path
-_ENOUGH = 0.05  # of the residual may be left: sweeps correct the rest
+_ENOUGH = 0.05  # of the residual may be left: GMRES corrects the rest
 _MOST = 30  # steps of conjugate gradients
 _DAMPING = 0.8  # of Jacobi's smoothing
 _SMOOTHINGS = 2  # before and after a coarser level

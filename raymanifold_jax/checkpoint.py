@@ -1,8 +1,8 @@
 """Checkpoints: the state of an iteration on disk, from which it goes on to the same result.
 
-A state is the arriving light so far, the residual, what Kahan's sum lost, the history, and what the solver carries from step to
-step; the right-hand side is worked out anew, and its bits must be those of the checkpoint's (a fingerprint of them is kept).
-Jacobi and Krylov save after a sweep; a run that goes on from there makes the same sweeps as one that was never stopped.
+A state is the arriving light so far, the residual, what Kahan's sum lost, and the history; the right-hand side is worked out
+anew, and its bits must be those of the checkpoint's (a fingerprint of them is kept). Jacobi saves after a sweep, Krylov after a
+restart; a run that goes on from there makes the same sweeps as one that was never stopped.
 
 Public names: `Checkpoint`.
 """
@@ -37,11 +37,8 @@ class Checkpoint:
         self._last = time.monotonic()
         self._fingerprint = ""
 
-    def restore(self, problem: Any, state: Any, each: Any) -> tuple[Any, list[Any]] | None:
-        """The saved state, in the form of `state`, and what else was saved, each in the form of `each`.
-
-        None to start from the beginning. `problem`: what must not have changed.
-        """
+    def restore(self, problem: Any, state: Any) -> Any | None:
+        """The saved state, in the form of `state`; None to start from the beginning. `problem`: what must not have changed."""
         digest = hashlib.sha256()
         for leaf in jax.tree.leaves(problem):
             values = np.asarray(leaf)
@@ -52,14 +49,11 @@ class Checkpoint:
         from .io.archive import read_archive
 
         manifest, arrays = read_archive(self.path, "checkpoint")
-        form, form_of_each = jax.tree.structure(state), jax.tree.structure(each)
-        first, size = form.num_leaves, form_of_each.num_leaves
-        saved = [arrays[f"s{i}"] for i in range(len(arrays))]
-        if manifest.get("fingerprint") != self._fingerprint or (len(saved) - first) % size:
+        if manifest.get("fingerprint") != self._fingerprint:
             got = f"{str(self.path)!r}, which belongs to another solve"
             checks.fail("checkpoint", got, "the same scene, directions and options", "start afresh without resume")
-        others = [jax.tree.unflatten(form_of_each, saved[i : i + size]) for i in range(first, len(saved), size)]
-        return jax.tree.unflatten(form, saved[:first]), others
+        leaves, form = jax.tree.flatten(state)
+        return jax.tree.unflatten(form, [arrays[f"s{i}"] for i in range(len(leaves))])
 
     def keep(self, state: Any, at_once: bool = False) -> None:
         """Save the state, if the interval is over."""

@@ -8,9 +8,9 @@ whatever iteration found it. Where T, R and s change,
 
     da = (I - T R)^-1 (d(T R) (s + a) + T R ds),        and backwards        l = a' + R'T' l,
 
-the second with the transposed sweep; l is then pulled back through one application of T R. Both are solved by
-the steps of `krylov` on u = v + A u: of known numbers on the host, with diffusion for a preconditioner (`acceleration`); while
-JAX traces (`jit`, `vmap`), without one, in a loop of the program, and a solve keeps no record of its sweeps.
+the second with the transposed sweep; l is then pulled back through one application of T R. Both are solved by restarted GMRES
+on u = v + A u. Known numbers are iterated on the host, with diffusion for a preconditioner (`acceleration`); while JAX traces
+(`jit`, `vmap`) plain steps make up a loop of the program, and a solve keeps no record of its sweeps.
 
 Public: `attach`, `Unwatched`.
 """
@@ -27,17 +27,18 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Int
+from jaxtyping import Array, Float, Int
 
 from . import checks
 from .acceleration import Diffusion
 from .adjoint import linear
 from .arrays import stop_gradient
 from .iteration import Certificate, System
-from .krylov import FEW, Direction, linear_solve, no_directions, norm, step
+from .krylov import dot, linear_solve, norm
 from .operator import Light, Materials, Transport
 from .solvers import Krylov
 
+_RESTART = 8
 _Residuals = tuple[Transport, Materials, Diffusion | None]
 _SHARE = 0.1  # of the solve's tolerance that residuals of derivatives may have, relative to what is solved for
 
@@ -52,7 +53,7 @@ class Unwatched:
         self.arriving = _Solve(rtol, most, False)((known.transport, known.materials, None), first)
         self.bound = self.target = self.rounding = math.nan
         self.residuals, self.sweeps, self.certificate = [math.nan], 0, Certificate(math.nan, 0)
-        self.ending, self.solver = "", Krylov(diffusion=False)
+        self.ending, self.solver = "", Krylov(_RESTART, diffusion=False)
 
 
 def attach(system: System, arriving: Light, rtol: float, most: int) -> Light:
@@ -104,7 +105,7 @@ class _Solve:
         apply = lambda u: _apply(self.transposed, residuals, u)
         tolerance = max(_SHARE * self.rtol, 16 * float(jnp.finfo(operand.elements.dtype).eps))
         if checks.is_traced((residuals, operand)):
-            return _solved_within(apply, operand, tolerance, self.most)
+            return _gmres(apply, operand, tolerance, self.most)
         near = residuals[2]
         precondition = (lambda u: u) if near is None else near.of_arriving_transposed if self.transposed else near.of_arriving
         target = tolerance * float(norm(operand))
@@ -132,26 +133,73 @@ def _apply(transposed: bool, residuals: _Residuals, light: Light) -> Light:
     return transport(stuff.reflected(light), fluence=stuff.extinction is not None, scattered=True)
 
 
-# The solver of `krylov` as a loop of a program
+# GMRES (see `krylov`) as a loop of a program
 
 
 class _State(NamedTuple):
     solution: Light
-    residual: Light
-    directions: tuple[Direction, ...]
+    basis: Light  # stacked: _RESTART + 1
+    hessenberg: Float[Array, "m1 m"]
+    length: Float[Array, ""]  # of the residual the cycle began with
+    left: Float[Array, ""]  # of the residual now
+    step: Int[Array, ""]
     count: Int[Array, ""]
 
 
-def _solved_within(apply: Callable[[Light], Light], right: Light, tolerance: float, most: int) -> Light:
+def _gmres(apply: Callable[[Light], Light], right: Light, tolerance: float, most: int) -> Light:
     """u with |right + A u - u| <= tolerance |right|, Euclidean."""
-    target = tolerance * norm(right)
+    state, scale, target = _begin(right, tolerance)
+    last = lambda state: jax.tree.map(lambda b: lax.dynamic_index_in_dim(b, state.step, 0, keepdims=False), state.basis)
+    going = lambda state: (state.left > target) & (state.count < most)
+    state = lax.while_loop(going, lambda state: _advance(state, apply(last(state)), target), state)
+    return jax.tree.map(lambda x: x * scale, state.solution)
+
+
+@jax.jit
+def _begin(right: Light, tolerance) -> tuple[_State, Array, Array]:
+    # Scaled, so that squares neither overflow nor vanish: loss functions may be tiny.
+    largest = right.largest()
+    scale = jnp.where(largest > 0, largest, 1.0)
+    right = jax.tree.map(lambda x: x / scale, right)
+    length = jnp.sqrt(dot(right, right))
+    real = right.elements.dtype
+    basis = jax.tree.map(lambda x: jnp.zeros((_RESTART + 1, *x.shape), real), right)
+    first = jax.tree.map(lambda b, x: b.at[0].set(x / jnp.where(length > 0, length, 1.0)), basis, right)
     none = jnp.zeros((), np.int32)
-    state = _State(jax.tree.map(jnp.zeros_like, right), right, no_directions(right, right, FEW), none)
+    nothing = jax.tree.map(jnp.zeros_like, right)
+    state = _State(nothing, first, jnp.zeros((_RESTART + 1, _RESTART), real), length, length, none, none)
+    return state, scale, tolerance * length
 
-    def advance(state: _State) -> _State:
-        both = lambda sent: (sent, apply(sent))
-        solution, residual, direction = step(both, lambda u: u, state.solution, state.residual, state.directions)
-        return _State(solution, residual, (*state.directions[1:], direction), state.count + 1)
 
-    going = lambda state: (norm(state.residual) > target) & (state.count < most)
-    return lax.while_loop(going, advance, state).solution
+@jax.jit
+def _advance(state: _State, image: Light, target: Array) -> _State:
+    """One step: `image` is A applied to the last vector of the basis."""
+    basis, step = state.basis, state.step
+    vector = jax.tree.map(lambda b, x: lax.dynamic_index_in_dim(b, step, 0, keepdims=False) - x, basis, image)
+    column = jnp.zeros(_RESTART + 1, state.length.dtype)
+    for _ in range(2):  # twice is enough, in float32 too; unused vectors are 0
+        overlap = sum(jax.tree.leaves(jax.tree.map(lambda b, x: jnp.tensordot(b, x, x.ndim), basis, vector)))
+        vector = jax.tree.map(lambda b, x, overlap=overlap: x - jnp.tensordot(overlap, b, 1), basis, vector)
+        column = column + overlap
+    length = jnp.sqrt(dot(vector, vector))
+    inverse = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)
+    basis = jax.tree.map(lambda b, x: lax.dynamic_update_index_in_dim(b, x * inverse, step + 1, 0), basis, vector)
+    hessenberg = state.hessenberg.at[:, step].set(column.at[step + 1].set(length))
+    right = jnp.zeros_like(column).at[0].set(state.length)
+    weights = jnp.linalg.lstsq(hessenberg, right)[0]
+    residual = right - hessenberg @ weights
+    left = jnp.sqrt(jnp.sum(residual**2))
+    ends = (step + 1 == _RESTART) | (left <= target) | (length <= 1e-6 * state.length)
+
+    def end(_):
+        solution = jax.tree.map(lambda s, b: s + jnp.tensordot(weights, b[:-1], 1), state.solution, basis)
+        vector = jax.tree.map(lambda b: jnp.tensordot(residual, b, 1), basis)
+        size = jnp.sqrt(dot(vector, vector))
+        inverse = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1.0), 0.0)
+        first = jax.tree.map(lambda b, x: jnp.zeros_like(b).at[0].set(x * inverse), basis, vector)
+        return _State(solution, first, jnp.zeros_like(hessenberg), size, size, jnp.zeros_like(step), state.count + 1)
+
+    def go_on(_):
+        return _State(state.solution, basis, hessenberg, state.length, left, step + 1, state.count + 1)
+
+    return lax.cond(ends, end, go_on, None)

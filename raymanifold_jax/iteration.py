@@ -8,9 +8,9 @@ and after one more step x' = b + K x the same with F - 1 for F, because (I - K)^
 row of K adds up to less than 1; better is a solution of (I - K) w = 1, which need not be exact. The last change is no such
 bound: at albedo 0.99 it can be 100 times smaller than the error.
 
-Combinations of sweeps leave residuals of either sign, large in few places, of which max |r| F makes far too much. One sweep
-more for any u says better: if |r| <= u - K u + t (w - K w), then |x* - x| <= u + t w; here u is what diffusion makes of |r|, or
-a few orders of bounces do.
+GMRES leaves residuals of either sign, large in few places, of which max |r| F makes far too much. One sweep more for any u says
+better: if |r| <= u - K u + t (w - K w), then |x* - x| <= u + t w; here u is what diffusion makes of |r|, or a few orders of
+bounces do.
 
 Public: `System`, `Certificate`, `Iteration`, `certify`.
 """
@@ -19,7 +19,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -180,7 +179,6 @@ class Iteration:
         self._rtol, self._most, self._meter = rtol, most, meter
         self.lost = self.arriving  # the low bits of Jacobi's sum
         self.checkpoint: Checkpoint | None = None
-        self.memory: list[Light] = []  # what a solver carried from step to step, where it goes on from a checkpoint
         self.stuck = False  # a solver's own word that it cannot go on
         self._more = 0  # sweeps that led to no iterate
         self._tight = math.inf  # a bound on the present iterate's error, better than the factor's
@@ -188,32 +186,39 @@ class Iteration:
         self.asked = False  # for so many bounces and no more
         self.before: Light | None = None  # then: the bounced light one bounce earlier, if there was any
 
+    def _state(self) -> tuple:
+        return self.arriving, self.residual, self.lost, np.array(self.residuals), np.array(self.target)
+
     def resume(self, checkpoint: Checkpoint) -> None:
         """Save the state to a checkpoint from now on, and go on from what it holds."""
         self.checkpoint = checkpoint
-        found = checkpoint.restore((self.system.source, self.system.materials, self._rtol), self._state(), self.arriving)
+        found = checkpoint.restore((self.system.source, self.system.materials, self._rtol), self._state())
         if found is not None:
-            (residuals, (target, self._gain, more), *light), memory = found
-            self.residuals, self.target, self._more = [float(r) for r in residuals], float(target), int(more)
-            (self.arriving, self.residual, self.lost), self.memory = jax.tree.map(jnp.asarray, (light, memory))
-
-    def _state(self) -> tuple:
-        numbers = np.array([self.target, self._gain, self._more])
-        return np.array(self.residuals), numbers, self.arriving, self.residual, self.lost
+            arriving, residual, lost, residuals, target = found
+            self.arriving, self.residual, self.lost = jax.tree.map(jnp.asarray, (arriving, residual, lost))
+            self.residuals, self.target = [float(r) for r in residuals], float(target)
 
     def start_from(self, leaving: Light) -> None:
         """Begin with light that leaves, for one sweep, if that is nearer than none."""
-        arriving, again = self.system.bounce(leaving)
-        residual = combine([1, 1, -1], [self.system.materials.reflected(self.system.source), again, leaving])
+        arriving, residual = self._after(leaving)
         if float(residual.largest()) < self.residuals[0]:
             self.reach(arriving, residual)
         else:
             self.spend(1)
 
-    def keep(self, memory: Sequence[Light] = ()) -> None:
-        """A place from which to go on, with what the solver carries there: save the state if it is time."""
+    def work_out(self) -> None:
+        """The residual of the light so far by a sweep, where a solver carried it from step to step and rounding with it."""
+        self.reach(*self._after(self.system.materials.reflected(self.system.source + self.arriving)))
+
+    def _after(self, leaving: Light) -> tuple[Light, Light]:
+        """What arrives of light that leaves, and its residual."""
+        arriving, again = self.system.bounce(leaving)
+        return arriving, combine([1, 1, -1], [self.system.materials.reflected(self.system.source), again, leaving])
+
+    def keep(self) -> None:
+        """A place from which to go on: save the state if it is time."""
         if self.checkpoint is not None:
-            self.checkpoint.keep((*self._state(), *memory))
+            self.checkpoint.keep(self._state())
 
     @property
     def bound(self) -> float:

@@ -1,21 +1,18 @@
-"""(I - K) x = b by generalised conjugate residuals, one application of K a step, and arithmetic of light.
+"""GMRES on (I - K) x = b, one application of K a step, and arithmetic of light.
 
-With the residual r of the guess, a step sends z = M r through K. From w = (I - K) z its parts along the w of steps before are
-taken off, from z the same of their z, and then
+With the residual r of the guess, the basis v_0 = r / |r|, v_1, ... is orthonormal, and step k sends z_k = M v_k through K:
 
-    x gains z <r, w> / <w, w>,        r loses w <r, w> / <w, w>:
+    (I - K) z_k = v_0 h_0k + ... + v_{k+1} h_{k+1,k},       x = sum y_k z_k,       |r - (I - K) x| as small as can be.
 
-|r| is as small as it can be with all of them (Eisenstat, Elman & Schultz, SIAM J. Numer. Anal. 20, 1983). With all steps kept
-this is GMRES; where it converges quickly, (I - K) M is nearly symmetric, and the last few will do. M, the preconditioner, may
-change from step to step. What is kept of each step is the caller's choice: z, or what of it arrives.
+M, the preconditioner, may change from step to step (flexible GMRES: Saad, SIAM J. Sci. Comput. 14, 1993). What is kept of
+each step is the caller's choice: z_k, or what of it arrives. The numbers h are worked with in float64 on the host.
 
-Public: `Direction`, `step`, `FEW`, `MANY`, `linear_solve`, `combine`, `dot`, `norm`.
+Public: `Subspace`, `linear_solve`, `combine`, `dot`, `norm`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -26,38 +23,51 @@ from .arrays import zeros_like
 from .operator import Light
 from .programs import program
 
-FEW = 5  # steps to keep where each at least halves the residual
-MANY = 12  # elsewhere
+_INDEPENDENT = 1e-6  # of the first residual: less than this of a new direction is rounding
 
 
-class Direction(NamedTuple):
-    """A step that was made: what is kept of it, and its w, of length 1."""
+class Subspace:
+    """What GMRES knows after some steps from a residual `start`.
 
-    kept: Light
-    image: Light
+    `apply(z)` returns (what to keep of z, K z). `residual` is what is left of `start`; `gain()` the same combination of what
+    was kept as x is of the z; `exhausted`: no further step can help.
+    """
 
+    def __init__(self, apply: Callable[[Light], tuple[Light, Light]], start: Light, size: int, precondition: Callable):
+        self._apply, self._precondition = apply, precondition
+        self._length = float(norm(start))
+        empty = zeros_like(start)
+        self._basis = [combine([1 / self._length], [start])] + [empty] * size
+        self._kept: list[Light] = []
+        self._steps = 0
+        self._hessenberg = np.zeros((size + 1, size))
+        self._weights = np.zeros(0)
+        self.residual, self.exhausted = start, False
 
-def step(
-    apply: Callable[[Light], tuple[Light, Light]],
-    precondition: Callable[[Light], Light],
-    solution: Light,
-    residual: Light,
-    before: Sequence[Direction],
-) -> tuple[Light, Light, Direction]:
-    """The next solution, its residual, and the direction taken; `apply(z)` returns (what to keep of z, K z)."""
-    unit, scale = _unit(residual)
-    sent = precondition(unit)
-    kept, passed = apply(sent)
-    # One program for few and one for many.
-    missing = FEW - len(before) if len(before) <= FEW else -len(before) % MANY
-    filled = (*before, *(no_directions(kept, residual, missing) if missing else ()))
-    solution, residual, direction = _step(solution, residual, scale, filled, sent, kept, passed)
-    return solution, residual, direction
+    def step(self) -> None:
+        k, size = self._steps, len(self._basis) - 1
+        sent = self._precondition(self._basis[k])
+        kept, passed = self._apply(sent)
+        if not self._kept:  # always as many, so that one program adds them up
+            self._kept = [zeros_like(kept)] * size
+        self._kept[k] = kept
+        self._steps += 1
+        self._basis[k + 1], column = _arnoldi(tuple(self._basis), sent, passed)
+        hessenberg, column = self._hessenberg, np.asarray(column, np.float64)
+        hessenberg[:, k] = column[: len(hessenberg)]
+        hessenberg[k + 1, k] = column[-1]
+        small = hessenberg[: k + 2, : k + 1]
+        right = np.zeros(k + 2)
+        right[0] = self._length
+        weights = np.linalg.lstsq(small, right, rcond=None)[0]
+        left = np.zeros(size + 1)
+        left[: k + 2] = right - small @ weights
+        self._weights = np.append(weights, np.zeros(size - k - 1))
+        self.residual = combine(left, self._basis)
+        self.exhausted = k + 1 == size or hessenberg[k + 1, k] <= _INDEPENDENT * abs(hessenberg[: k + 1, k]).max()
 
-
-def no_directions(kept: Light, image: Light, count: int) -> tuple[Direction, ...]:
-    """Zeros, which change nothing, alike what these are."""
-    return (Direction(zeros_like(kept), zeros_like(image)),) * count
+    def gain(self) -> Light:
+        return combine(self._weights, self._kept)
 
 
 def linear_solve(
@@ -66,6 +76,7 @@ def linear_solve(
     precondition: Callable[[Light], Light] = lambda light: light,
     good: Callable[[Light], bool] | None = None,
     most: int = 200,
+    restart: int = 12,
 ) -> tuple[Light, Light, int]:
     """Solve (I - K) x = right for any linear `apply`, K or its transpose, with light of any sign.
 
@@ -75,45 +86,30 @@ def linear_solve(
     target = 1e-5 * float(norm(right))
     good = (lambda residual: float(norm(residual)) <= target) if good is None else good
     solution, residual, count = zeros_like(right), right, 0
-    directions: list[Direction] = []
-    both = lambda sent: (sent, apply(sent))
     while count < most and not good(residual):
-        solution, residual, direction = step(both, precondition, solution, residual, directions)
-        directions = [*directions, direction][-MANY:]
-        count += 1
+        space = Subspace(lambda sent: (sent, apply(sent)), residual, restart, precondition)
+        while True:
+            space.step()
+            count += 1
+            if space.exhausted or count >= most or good(space.residual):
+                break
+        solution, residual = solution + space.gain(), space.residual
     return solution, residual, count
 
 
 @program
-def _unit(light: Light) -> tuple[Light, Array]:
-    """Over its largest value, so that squares neither overflow nor vanish, and that value."""
-    scale = jnp.maximum(light.largest(), jnp.finfo(light.elements.dtype).tiny)
-    return jax.tree.map(lambda x: x / scale, light), scale
-
-
-@program
-def _step(
-    solution: Light, residual: Light, scale: Array, before: tuple[Direction, ...], sent: Light, kept: Light, passed: Light
-) -> tuple[Light, Light, Direction]:
-    image = jax.tree.map(jnp.subtract, sent, passed)
-    images = [direction.image for direction in before]
-    overlaps = [jnp.zeros((), scale.dtype)] * len(before)
+def _arnoldi(basis: tuple[Light, ...], sent: Light, passed: Light) -> tuple[Light, Array]:
+    """The next basis vector: (I - K) sent, made orthogonal to the basis; `passed` is K sent. Unused vectors are 0."""
+    vector = jax.tree.map(jnp.subtract, sent, passed)
+    column = jnp.zeros(len(basis), sent.elements.dtype)
     for _ in range(2):  # twice is enough, in float32 too
-        more = [dot(image, other) for other in images]
-        image, overlaps = _less(image, more, images), list(map(jnp.add, overlaps, more))
-    kept = _less(kept, overlaps, [direction.kept for direction in before])
-    length = norm(image)
-    inverse = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)
-    kept, image = (jax.tree.map(lambda x: x * inverse, light) for light in (kept, image))
-    along = scale * dot(jax.tree.map(lambda x: x / scale, residual), image)
-    return _less(solution, [-along], [kept]), _less(residual, [along], [image]), Direction(kept, image)
-
-
-def _less(light: Light, weights: Sequence[Array], others: Sequence[Light]) -> Light:
-    """Light without so much of the others."""
-    for weight, other in zip(weights, others, strict=True):
-        light = jax.tree.map(lambda x, o, weight=weight: x - weight * o, light, other)
-    return light
+        overlap = jnp.stack([dot(b, vector) for b in basis])
+        for k, b in enumerate(basis):
+            vector = jax.tree.map(lambda v, x, k=k, overlap=overlap: v - overlap[k] * x, vector, b)
+        column = column + overlap
+    length = norm(vector)
+    scale = jnp.where(length > 0, 1 / jnp.where(length > 0, length, 1.0), 0.0)
+    return jax.tree.map(lambda v: v * scale, vector), jnp.append(column, length)
 
 
 def dot(a: Light, b: Light) -> Array:
@@ -123,8 +119,9 @@ def dot(a: Light, b: Light) -> Array:
 @program
 def norm(light: Light) -> Array:
     """The 2-norm, with squares that neither overflow nor vanish."""
-    unit, scale = _unit(light)
-    return scale * jnp.sqrt(dot(unit, unit))
+    scale = jnp.maximum(light.largest(), jnp.finfo(light.elements.dtype).tiny)
+    scaled = jax.tree.map(lambda x: x / scale, light)
+    return scale * jnp.sqrt(dot(scaled, scaled))
 
 
 @program

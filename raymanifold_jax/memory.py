@@ -28,10 +28,10 @@ GEOMETRY = 30  # words a voxel: planes, the samples of the signed distance, copi
 FIELDS_VACUUM = 11  # words a voxel and band: sums of a sweep, fluence of sun, sky and bounces
 FIELDS_MEDIUM = 68  # the same, coefficients, source, the multigrid's, and the iteration's unknowns of many sweeps
 BUFFERS = 32  # words a voxel
-LINKS = 13  # bytes an element and direction, half of which come from behind it
+LINKS = 13  # bytes an element and direction, half of which come from behind it, while they are sorted; 8 of 20 remain
 MOST_LINKS = 1 << 30  # bytes: more are not made
 LARGE = 1 << 22  # bytes of an array: smaller ones are not worth giving back
-HELD = 0.65
+HELD = 0.65  # of large fields' memory, beside all that ever is allocated
 ELEMENT = 1000  # bytes an element: its rows in each axis's reads, position, material
 
 Shape = tuple[int, int, int]
@@ -99,7 +99,9 @@ def give_back_freed(size: int) -> None:
 def _trim() -> Callable[[int], int] | None:
     """glibc's `malloc_trim`; None where there is another C library."""
     try:
-        return ctypes.CDLL(None).malloc_trim
+        trim = ctypes.CDLL(None).malloc_trim
+        trim.argtypes = [ctypes.c_size_t]
+        return trim
     except (AttributeError, OSError, TypeError):
         return None
 

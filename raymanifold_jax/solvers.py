@@ -2,9 +2,9 @@
 
 - `Jacobi` adds up orders of bounced light: the k-th iterate holds light of up to k bounces (Langer et al. 1995, eq. 1). As many
   sweeps as light bounces: fine below albedos of 0.5, hopeless near 1.
-- `Krylov` takes the combination of what it has swept that leaves the smallest residual (`krylov`), and sends what diffusion
-  makes of the residual (`acceleration`): ten to twenty sweeps, whatever the albedo and the optical depth.
-- `Anderson` mixes the last few iterates instead: nearly as good.
+- `Krylov` takes the combination of what it has swept that leaves the smallest residual (GMRES), and sends what diffusion makes
+  of the residual (`acceleration`): ten to twenty sweeps, whatever the albedo and the optical depth.
+- `Anderson` mixes the last few iterates instead: nearly as good, with less memory, and no restarts.
 - `OptimistixFixedPoint` leaves the iteration to a solver of optimistix (`optimistix_solver`).
 
 All start from the light straight from the sources, and stop on the same certified bound.
@@ -14,16 +14,15 @@ Public: `Jacobi`, `Krylov`, `Anderson`, `automatic`, `worth_diffusing`.
 
 from __future__ import annotations
 
-import itertools
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from . import checks
 from .arrays import ones_like
 from .iteration import Iteration, System
-from .krylov import FEW, MANY, Direction, combine, dot, norm, step
+from .krylov import Subspace, combine, dot, norm
 from .operator import Light
 from .programs import program
 
@@ -69,29 +68,28 @@ def _add(total: Light, lost: Light, order: Light) -> tuple[Light, Light]:
 
 
 class Krylov(eqx.Module):
-    """Generalised conjugate residuals (`krylov`): each sweep is combined with the last `history`, or with the last few as long
-    as each at least halves the residual; two fields more for each of them.
+    """GMRES on (I - K) x = b, restarted after `restart` sweeps; 2 `restart` + 1 fields more.
 
     With `diffusion`, preconditioned by it (`acceleration`): nearly the same number of sweeps at any albedo and optical depth.
     """
 
-    history: int = eqx.field(static=True, default=MANY)
+    restart: int = eqx.field(static=True, default=12)
     diffusion: bool = eqx.field(static=True, default=True)
 
+    def __check_init__(self) -> None:
+        checks.positive_int("restart", self.restart)
+
     def run(self, iteration: Iteration) -> None:
-        system = iteration.system
-        precondition = system.precondition if self.diffusion else lambda light: light
-        directions = [Direction(*pair) for pair in zip(iteration.memory[::2], iteration.memory[1::2], strict=True)]
+        precondition = iteration.system.precondition if self.diffusion else lambda light: light
         while not iteration.over:
-            arriving, residual, direction = step(
-                system.bounce, precondition, iteration.arriving, iteration.residual, directions
-            )
-            iteration.reach(arriving, residual)
-            quick = all(after <= before / 2 for before, after in itertools.pairwise(iteration.residuals))
-            directions = [*directions, direction][-min(self.history, FEW if quick else self.history) :]
-            if iteration.close:
-                iteration.polish()
-            iteration.keep([light for pair in directions for light in pair])
+            begun = iteration.arriving
+            space = Subspace(iteration.system.bounce, iteration.residual, self.restart, precondition)
+            while not (iteration.over or space.exhausted):
+                space.step()
+                iteration.reach(begun + space.gain(), space.residual)
+                if iteration.close:
+                    iteration.polish()
+            iteration.keep()
 
 
 class Anderson(eqx.Module):
@@ -103,6 +101,9 @@ class Anderson(eqx.Module):
 
     history: int = eqx.field(static=True, default=6)
     diffusion: bool = eqx.field(static=True, default=True)
+
+    def __check_init__(self) -> None:
+        checks.positive_int("history", self.history)
 
     def run(self, iteration: Iteration) -> None:
         system = iteration.system
@@ -121,6 +122,9 @@ class Anderson(eqx.Module):
             iteration.reach(after, new)
             if iteration.close:
                 iteration.polish()
+            if iteration.converged:  # changes that differ little from one another make much of rounding
+                iteration.work_out()
+                changes = []
             iteration.keep()
 
 

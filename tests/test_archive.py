@@ -147,7 +147,7 @@ class StopAfter(rm.Checkpoint):
             raise Stop
 
 
-@pytest.mark.parametrize("solver", [rm.Jacobi(), rm.Krylov(history=3)])
+@pytest.mark.parametrize("solver", [rm.Jacobi(), rm.Krylov(restart=3)])
 def test_a_stopped_solve_goes_on_to_the_same_bits(tmp_path, solver):
     path, options = tmp_path / "run.npz", {"solver": solver, "progress": False, "rtol": 1e-4}
     straight = rm.solve(SCENE, DIRECTIONS, **options)

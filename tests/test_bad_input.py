@@ -41,6 +41,14 @@ def test_solve_refuses(scene, options, error, message):
         rm.solve(scene, **options)
 
 
+@pytest.mark.parametrize(("solver", "name"), [(rm.Krylov, "restart"), (rm.Anderson, "history")])
+def test_solvers_refuse(solver, name):
+    with pytest.raises(ValueError, match=f"{name}: got 0, expected a whole number >= 1"):
+        solver(**{name: 0})
+    with pytest.raises(TypeError, match=f"{name}: got 2.5, expected a whole number"):
+        solver(**{name: 2.5})
+
+
 def scene_with(*lights, solid=None, sides=None):
     solids = [rm.Solid(rm.Sphere((1, 1, 1), 0.5))] + ([] if solid is None else [solid])
     return rm.Scene(rm.Lattice((8, 8, 8), 0.25), solids, lights=lights, boundary=sides or rm.Boundary())

@@ -45,15 +45,28 @@ def test_few_sweeps_at_any_albedo_and_depth(x64, surface, scattering, depth):
     assert difference(solution, tight) <= solution.error_bound + tight.error_bound
 
 
+@pytest.mark.parametrize("solver", [rm.Krylov(), rm.Anderson()], ids=["krylov", "anderson"])
+def test_no_false_bound_in_single_precision(solver):
+    # 125 mean free paths a voxel: residuals hardly fall from step to step at first, and differences of steps are mostly
+    # rounding. A solver that carries its residual on through these says 1e-4 and is off by 0.1.
+    scene = lambda: foggy_room(0.9, 1000 / 1000.1, 1000.1)
+    with jax.enable_x64(True):
+        tight = rm.solve(scene(), DIRECTIONS, rtol=1e-6, progress=False)
+    solution = rm.solve(scene(), DIRECTIONS, rtol=1e-4, solver=solver, max_sweeps=300, progress=False)
+    assert solution.converged or isinstance(solver, rm.Anderson), solution.result
+    bound = solution.error_bound + solution.rounding + tight.error_bound
+    assert difference(solution, tight) <= bound and solution.rounding < 0.03
+
+
 @pytest.mark.slow
 def test_long_corridor_in_few_sweeps():
-    # Vacuum, where light diffuses from wall to wall: 10 sweeps, and 38 without the preconditioner.
+    # Vacuum, where light diffuses from wall to wall: six times fewer sweeps than without the preconditioner, at least.
     wall = rm.Wall(0.99)
     scene = rm.Scene(rm.Lattice((48, 4, 4), 0.25), boundary=rm.Boundary((rm.Wall(0.99, 1.0), wall), wall, wall))
     with_it, without = (
         rm.solve(scene, DIRECTIONS, solver=rm.Krylov(diffusion=d), progress=False, max_sweeps=150) for d in (True, False)
     )
-    assert with_it.converged and with_it.sweeps <= 15 and without.sweeps >= 3 * with_it.sweeps
+    assert with_it.converged and with_it.sweeps <= 20 and without.sweeps >= 6 * with_it.sweeps
 
 
 @functools.cache

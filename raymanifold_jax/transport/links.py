@@ -93,7 +93,7 @@ def _arriving(links: Links, exitance: Float[Array, "C E"]) -> Float[Array, "C E"
     voxels = voxels.at[:, links.number].add(exitance[:, links.element] * links.share)
     sums = jnp.zeros((bands, links.elements), exitance.dtype)
     if isinstance(links.rows, _List):
-        first, source, weight = links.rows.parts
+        first, source, weight = lax.optimization_barrier(links.rows.parts)  # or XLA spends long on working this out ahead
         element = jnp.repeat(np.arange(links.elements), jnp.diff(first), total_repeat_length=len(source))
         return sums.at[:, element].add(weight * voxels[:, source], indices_are_sorted=True)
     for rows in links.rows:

@@ -15,6 +15,7 @@ import dataclasses
 import functools
 import importlib
 import importlib.util
+import itertools
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
@@ -219,9 +220,8 @@ def views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray)
     from .derivative import Manner
 
     real = np.dtype(layout.plane.dtype)
-    found: list[list[tuple[np.ndarray, ...]]] = [[] for _ in range(count_cores())]
 
-    def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> None:
+    def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> list[list[tuple[np.ndarray, ...]]]:
         planes, cut, hits, probes = arguments
         codes = numbers.transpose(AXES[axis]).reshape(-1).astype(np.int32)
         listed = _contiguous(tuple(codes[_flat(cells, line.area)] for cells in (cut, line.ghosts)))
@@ -238,16 +238,15 @@ def views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray)
                 seen.append(tuple(values[:count].copy() for values in lists))
             return seen
 
-        for of_core, seen in zip(found, on_cores(run, line.parts), strict=False):
-            of_core.extend(seen)
+        return list(on_cores(run, line.parts))
 
-    for line in _lines(Manner(False), layout, ordinates, None, 1, False, real):
-        along(*line)
-    return _sorted(found, layout.elements, real)
+    found = [along(*line) for line in _lines(Manner(False), layout, ordinates, None, 1, False, real)]
+    of_cores = itertools.zip_longest(*found, fillvalue=[])
+    return _sorted([[links for seen in core for links in seen] for core in of_cores], layout.elements, real)
 
 
 def _sorted(parts: list[list[tuple[np.ndarray, ...]]], elements: int, real: np.dtype) -> Listed:
-    """Lists of element, source and weight, some for each core, as one."""
+    """Lists of element, source and weight, some for each core, as one; they are emptied on the way."""
     from . import machine_code as code
 
     def tally(part: list[tuple[np.ndarray, ...]]) -> np.ndarray:
@@ -256,16 +255,16 @@ def _sorted(parts: list[list[tuple[np.ndarray, ...]]], elements: int, real: np.d
             code.tally(element, count)
         return count
 
-    counts = np.array(list(on_cores(tally, parts)))
+    counts = [np.zeros(elements, np.int32), *on_cores(tally, parts)]
     first = np.zeros(elements + 1, np.int32)
-    np.cumsum(counts.sum(0), out=first[1:])
+    np.cumsum(sum(counts), out=first[1:])
     # A core's links of an element come after those of the cores before.
-    places = _contiguous(tuple((first[:-1] + np.cumsum(counts, 0) - counts).astype(np.int32)))
+    places = [first[:-1] + before for before in itertools.accumulate(counts[:-1])]
     source, weight = np.empty(first[-1], np.int32), np.empty(first[-1], real)
 
     def sort(core: int) -> None:
-        for links in parts[core]:
-            code.sort(*links, places[core], source, weight)
+        while parts[core]:
+            code.sort(*parts[core].pop(), places[core], source, weight)
 
     list(on_cores(sort, range(len(parts))))
     return Listed(first, source, weight)
