@@ -241,8 +241,9 @@ def views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray)
         return list(on_cores(run, line.parts))
 
     found = [along(*line) for line in _lines(Manner(False), layout, ordinates, None, 1, False, real)]
-    of_cores = itertools.zip_longest(*found, fillvalue=[])
-    return _sorted([[links for seen in core for links in seen] for core in of_cores], layout.elements, real)
+    of_cores = [[links for seen in core for links in seen] for core in itertools.zip_longest(*found, fillvalue=[])]
+    del found
+    return _sorted(of_cores, layout.elements, real)
 
 
 def _sorted(parts: list[list[tuple[np.ndarray, ...]]], elements: int, real: np.dtype) -> Listed:
