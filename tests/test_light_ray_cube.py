@@ -245,6 +245,7 @@ def test_flat_floor_sees_the_whole_sky():
     np.testing.assert_allclose(_floor_under_the_sky(FIVE), 0.9948985, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_grazing_light_that_ends_in_the_layer_is_lost():
     # A direction that comes down r planes a hop reaches r of the M nodes in a column: 18 % of the light are lost.
     q, r = light_ray_cube(5), np.abs(cube_points(5)[:, 2])

@@ -244,7 +244,11 @@ def test_coordinate_evolutions_over_meshes(x64, kind, shape, scheme, meshes):
 
 @pytest.mark.parametrize(
     "kind, size, half_width, pe",
-    [("open", 9, 2, (4, 2)), ("periodic", 7, 1, (2, 4)), pytest.param("open", 64, 1, (64, 32), marks=pytest.mark.slow)],
+    [
+        ("open", 9, 2, (4, 2)),
+        pytest.param("periodic", 7, 1, (2, 4), marks=pytest.mark.slow),
+        pytest.param("open", 64, 1, (64, 32), marks=pytest.mark.slow),
+    ],
 )
 def test_an_emulated_array_of_elements(kind, size, half_width, pe):
     """2048 elements, as many as the paper's machine had: the same light to the last bit, element by element."""
