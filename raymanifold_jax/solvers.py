@@ -122,7 +122,8 @@ class Anderson(eqx.Module):
             iteration.reach(after, new)
             if iteration.close:
                 iteration.polish()
-            if iteration.converged:  # changes that differ little from one another make much of rounding
+            # Changes that differ little from one another make much of rounding: no bound rests on a residual that was carried.
+            if iteration.sweeps_left == 1 or (iteration.over and len(changes) > 1):
                 iteration.work_out()
                 changes = []
             iteration.keep()
