@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from . import machine_code
 
 _RAYS = 1 << 18  # rays that a core takes on at a time: they stay in its cache
+_LINE = 64  # bytes of a line of cache
 T = TypeVar("T")
 
 
@@ -127,7 +128,7 @@ def sweep(
 
         def run(part: np.ndarray):
             sums = [np.zeros((bands, len(r.cell))) for r in readers]
-            voxels, directions = np.zeros((line.shape[0], bands, line.area), real), min(how.rows, len(part))
+            voxels, directions = _lined_up((line.shape[0], bands, line.area), real), min(how.rows, len(part))
             known = part, line.ways, planes, cut, line.ghosts, hits, probes, light, how
             if volume is None:
                 code.in_vacuum(*known, _standing(code, line, directions, real), *sums, voxels)
@@ -180,7 +181,7 @@ def unsweep(
         of_hits, of_probes = _contiguous(tuple(asked[:, r.element] for r in readers))
 
         def run(part: np.ndarray):
-            field = lambda there: np.zeros((line.shape[0], bands, line.area) if there else (1, 1, 1), real)
+            field = lambda there: _lined_up((line.shape[0], bands, line.area) if there else (1, 1, 1), real)
             listed = lambda cells: np.zeros((bands, len(cells.cell)), real)
             slopes, nothing = (field(sloped), field(sloped), field(sloped)), np.zeros((0, 1, 1), real)
             back = code.Light(field(medium), slopes, listed(line.cut), listed(line.ghosts), nothing, nothing[:, 0])
@@ -375,9 +376,10 @@ def _segments(code) -> machine_code.Segments:
 
 
 def _work(code, line: _Axis, directions: int, real) -> machine_code.Work:
-    size, width = line.area, line.shape[2]
+    size = line.area
     return code.Work(
-        rows=np.zeros((directions + 4, size + 2 * width), real), nowhere=np.zeros(size, real), asked=np.zeros((3, size), real),
+        rows=_lined_up((directions + 4, size + 2 * _margin(line, real)), real), nowhere=_lined_up((size,), real),
+        asked=_lined_up((3, size), real),
         here=_cut_blocks(code, line, real), sent=_of_ghosts(line, real), own=np.zeros(directions, int), free=np.zeros(4, int),
         point=np.zeros(3), whole=np.zeros(3), form=np.zeros((code.ROWS + 1) * code.BLOCK),
         picked=np.zeros(_most(line), np.uint32), at=np.zeros(code.BLOCK, np.uint32), way=_segments(code),
@@ -392,6 +394,10 @@ def _standing(code, line: _Axis, directions: int, real) -> machine_code.Standing
         here=_cut_blocks(code, line, real), sent=_of_ghosts(line, real), form=np.zeros((code.ROWS + 1) * code.BLOCK),
         at=np.zeros(code.BLOCK, np.uint32), way=_segments(code),
     )  # fmt: skip
+
+
+def _margin(line: _Axis, real: np.dtype) -> int:
+    return _whole_lines(line.shape[2], real)
 
 
 def _cut_blocks(code, line: _Axis, real) -> np.ndarray:
@@ -411,7 +417,8 @@ def _most(line: _Axis) -> int:
 def _arguments(code, layout: Layout, line: _Axis, medium: _Medium, axis: int) -> tuple:
     _, height, width = line.shape
     wrap_v = layout.pad[AXES[axis][2]] == 0
-    planes = code.Planes(height, width, wrap_v, float(layout.spacing), medium.even, medium.depth, medium.extinction)
+    margin, spacing = _margin(line, np.dtype(layout.plane.dtype)), float(layout.spacing)
+    planes = code.Planes(height, width, margin, wrap_v, spacing, medium.even, medium.depth, medium.extinction)
     readers = (
         r._replace(even=even, depth=depth, extinction=each)
         for r, (even, depth, each) in zip((line.hits, line.probes), medium.readers, strict=True)
@@ -428,14 +435,31 @@ def _contiguous(given: T) -> T:
 
 
 def _planes(field: np.ndarray, axis: int) -> np.ndarray:
-    """A padded field [C, X, Y, Z] as planes [K, C, P]."""
+    """A padded field [C, X, Y, Z] as planes [K, C, P], each of whole lines of cache."""
     a, u, v = AXES[axis]
     turned = field.transpose(1 + a, 0, 1 + u, 1 + v)
-    return np.ascontiguousarray(turned).reshape(*turned.shape[:2], -1)
+    size = turned.shape[2] * turned.shape[3]
+    planes = _lined_up((*turned.shape[:2], size), field.dtype)
+    planes[..., :size].reshape(turned.shape)[:] = turned
+    return planes
+
+
+def _lined_up(shape: tuple[int, ...], real: np.dtype) -> np.ndarray:
+    """Zeros, of which each row begins with a line of cache, with a few more at its end: what is written is twice as fast then."""
+    shape = (*shape[:-1], _whole_lines(shape[-1], real))
+    size = int(np.prod(shape)) * real.itemsize
+    memory = np.zeros(size + _LINE, np.uint8)
+    begin = -memory.__array_interface__["data"][0] % _LINE
+    return memory[begin : begin + size].view(real).reshape(shape)
+
+
+def _whole_lines(count: int, real: np.dtype) -> int:
+    a_line = _LINE // real.itemsize
+    return -(-count // a_line) * a_line
 
 
 def _from_planes(planes: np.ndarray, axis: int, shape: tuple[int, int, int]) -> np.ndarray:
-    field = planes.reshape(shape[0], -1, shape[1], shape[2])
+    field = planes[..., : shape[1] * shape[2]].reshape(shape[0], -1, shape[1], shape[2])
     dims = (0, 2, 3)
     return field.transpose(1, *(dims[AXES[axis].index(a)] for a in range(3)))
 
@@ -624,7 +648,8 @@ def _medium(layout: Layout, line: _Axis, axis: int, extinction, bands: int, real
 def _make_medium(line: _Axis, axis: int, extinction: Float[Array, "C X Y Z"], real: np.dtype) -> _Medium:
     from . import machine_code as code
 
-    planes = _planes(np.asarray(extinction), axis)
+    lined_up = _planes(np.asarray(extinction), axis)
+    planes = lined_up[..., : line.area]
     unlisted = line.unlisted[:, None]
     most = np.where(unlisted, planes, 0.0).max(-1)
     least = np.where(unlisted, planes, np.inf).min(-1)
@@ -640,6 +665,6 @@ def _make_medium(line: _Axis, axis: int, extinction: Float[Array, "C X Y Z"], re
 
     cut = planes[number(line.cut.first), :, line.cut.cell].T
     return _Medium(
-        True, even, depth, np.zeros((1, 1, 1), real) if np.all(even == code.EVEN) else planes, np.ascontiguousarray(cut),
+        True, even, depth, np.zeros((1, 1, 1), real) if np.all(even == code.EVEN) else lined_up, np.ascontiguousarray(cut),
         (of_readers(line.hits), of_readers(line.probes)),
     )  # fmt: skip

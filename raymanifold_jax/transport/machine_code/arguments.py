@@ -27,6 +27,7 @@ class Planes(NamedTuple):
 
     height: int
     width: int
+    margin: int  # in front of a plane of rays, and behind it: at least its width, in whole lines of cache
     wrap_v: bool
     spacing: float
     even: Any  # [K, C] EVEN: all voxels but the listed ones have the extinction `depth`; PATCHY: that or none; else UNEVEN
@@ -121,7 +122,7 @@ class Segments(NamedTuple):
 class Work(NamedTuple):
     """A core's own memory, of any content."""
 
-    rows: Any  # [rows + 4, P + 2 width] rays, both ends joined
+    rows: Any  # [rows + 4, P + 2 margin] rays, both ends joined
     nowhere: Any  # [P]
     asked: Any  # [3, P] of the rays before each segment (backwards)
     here: Any  # blocks of CUT voxels (see `cut`)

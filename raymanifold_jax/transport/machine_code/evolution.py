@@ -35,7 +35,7 @@ def begin_batch(work):
 def forwards(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, work, at_hits, at_probes, in_voxels):
     """One coordinate evolution in the `chosen` directions along one axis; adds to the sums [C, M], [C, M2] and [K, C, P]."""
     count, bands, size = planes.even.shape[0], planes.even.shape[1], planes.height * planes.width
-    margin = planes.width
+    margin = planes.margin
     rows, way, here, own, free = work.rows, work.way, work.here, work.own, work.free
     most = len(own)
     for first in range(0, len(chosen), most):
@@ -63,7 +63,7 @@ def forwards(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wor
                         for number in range(segments):
                             if planes.wrap_v and abs(way.move[number]) == 1 and planes.width > 1:
                                 turned = free[3]
-                                turn(rows[row[number]], rows[turned], way.move[number], planes.height, planes.width)
+                                turn(rows[row[number]], rows[turned], way.move[number], planes)
                                 free[3], free[number - 1] = row[number], turned
                                 row[number], way.move[number] = turned, 0
                             before, after = rows[row[number]], rows[row[number + 1]]
@@ -73,7 +73,7 @@ def forwards(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wor
                                 through_free(planes, k, c, number, way, length, come, gone, light, manner, work, sums, weight)
                             through_cut(cut, k, number, way, length, come, gone, manner, here, weight)
                             from_ghosts(ghosts, k, gone, work.sent)
-                            join_ends(after, margin, size)
+                            join_ends(after, planes)
                         if reading:
                             there = length, margin, light, planes.spacing, manner, work
                             read(False, hits, ways, n, k, c, segments, way, *there, at_hits)
@@ -85,19 +85,19 @@ def forwards(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wor
 @compiled
 def _moved_back(row, to, move, planes, size):
     """What was asked of the rays after a move, of the rays before it."""
-    margin = planes.width
+    margin = planes.margin
     if planes.wrap_v and abs(move) == 1 and planes.width > 1:
-        turn(row, to, -move, planes.height, planes.width)
+        turn(row, to, -move, planes)
         return
     for i in range(size):
         to[margin + i] = row[margin + i + move]
-    join_ends(to, margin, size)
+    join_ends(to, planes)
 
 
 def backwards(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_hits, of_probes, in_voxels, back):
     """The transpose of `forwards`: adds to `back` what weights of its three sums ask of what was sent."""
     count, bands, size = planes.even.shape[0], planes.even.shape[1], planes.height * planes.width
-    margin = planes.width
+    margin = planes.margin
     rows, way, here, own, free = work.rows, work.way, work.here, work.own, work.free
     asked, most = work.asked, len(own)
     for first in range(0, len(chosen), most):
@@ -134,7 +134,7 @@ def backwards(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_
                                 back_free(planes, k, c, number, way, length, *of_plane)
                             back_cut(cut, k, number, way, length, gone, come, ask_of, manner, here, weight)
                             back_ghosts(ghosts, k, c, gone, come, ask_of, back.ghost)
-                            join_ends(before, margin, size)
+                            join_ends(before, planes)
                             own[b], free[0] = free[0], own[b]
                             move = way.move[number]
                             if move:

@@ -124,20 +124,22 @@ def chords(ways, n, step, width, wrap_v, way):
 
 
 @compiled
-def join_ends(row, width, size):
+def join_ends(row, planes):
     """Planes are joined at both ends: what is before the first voxel is the last row, and the other way round."""
+    begin, width, size = planes.margin, planes.width, planes.height * planes.width
     for i in range(width):
-        row[i], row[size + width + i] = row[size + i], row[width + i]
+        row[begin - width + i], row[begin + size + i] = row[begin + size - width + i], row[begin + i]
 
 
 @compiled
-def turn(row, to, move, height, width):
+def turn(row, to, move, planes):
     """A step along v where each row's ends are joined."""
-    for u in range(height):
-        a = width + u * width
+    width = planes.width
+    for u in range(planes.height):
+        a = planes.margin + u * width
         for v in range(width):
             to[a + v] = row[a + (v - move) % width]
-    join_ends(to, width, height * width)
+    join_ends(to, planes)
 
 
 @register_jitable

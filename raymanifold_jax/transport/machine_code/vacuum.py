@@ -137,7 +137,7 @@ def in_vacuum(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wo
                             if summing:
                                 ahead, weight = shift[b], ways.weight[n] * way.share[number]
                                 _add_to(sums[:ahead], row[size - ahead :], weight)
-                                _add_to(sums[ahead:], row[: size - ahead], weight)
+                                _add_to(sums[ahead:size], row[: size - ahead], weight)
                             through_cut_in_vacuum(cut, k, number, way, row, shift[b], here, ways.weight[n])
                             _from_ghosts(ghosts, k, row, shift[b], work.sent)
                         if reading:
