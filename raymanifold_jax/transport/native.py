@@ -133,7 +133,7 @@ def sweep(
             if volume is None:
                 code.in_vacuum(*known, _standing(code, line, directions, real), *sums, voxels)
             else:
-                code.forwards(*known, _work(code, line, directions, real), *sums, voxels)
+                code.forwards(*known, _work(code, line, directions, code.TOGETHER, real), *sums, voxels)
             return sums, voxels
 
         parts = on_cores(run, _shared(_lit(layout, line, axis, inflow)) if dark else line.parts)
@@ -185,7 +185,7 @@ def unsweep(
             listed = lambda cells: np.zeros((bands, len(cells.cell)), real)
             slopes, nothing = (field(sloped), field(sloped), field(sloped)), np.zeros((0, 1, 1), real)
             back = code.Light(field(medium), slopes, listed(line.cut), listed(line.ghosts), nothing, nothing[:, 0])
-            work = _work(code, line, min(how.rows, len(part)), real)
+            work = _work(code, line, min(how.rows, len(part)), 1, real)
             code.backwards(part, line.ways, planes, cut, line.ghosts, hits, probes, how, work, of_hits, of_probes, wanted, back)
             return back
 
@@ -365,24 +365,33 @@ def _one_after_the_other(begin: Callable[..., Callable[[], None]], lines: Iterab
 
 
 def _manner(code, manner: Any, medium: _Medium, sloped: bool, line: _Axis, real) -> machine_code.Manner:
-    rows = max(2, _RAYS // max(line.area, 1))
-    thin = bool(manner.thin and not sloped)
-    return code.Manner(medium.there, sloped, thin, bool(manner.onward), bool(manner.fluence), thin_limit(real), min(rows, 32))
+    thin, rows = bool(manner.thin and not sloped), _at_a_time(code, line)
+    return code.Manner(medium.there, sloped, thin, bool(manner.onward), bool(manner.fluence), thin_limit(real), rows)
 
 
-def _segments(code) -> machine_code.Segments:
-    points = np.zeros((3, 3)), np.zeros((3, 3))
-    return code.Segments(np.zeros(3), *points, np.zeros(3, int), np.zeros(3), np.zeros(4, int))
+def _at_a_time(code, line: _Axis) -> int:
+    """How many directions a core takes on: those it is given in parts of about the same size."""
+    most, fit = max(map(len, line.parts)), max(2, _RAYS // max(line.area, 1))
+    each = -(-most // -(-most // fit))
+    return -(-each // code.TOGETHER) * code.TOGETHER
 
 
-def _work(code, line: _Axis, directions: int, real) -> machine_code.Work:
+def _segments(code, *of: int) -> machine_code.Segments:
+    three, points = (*of, 3), (*of, 3, 3)
+    return code.Segments(
+        np.zeros(three), np.zeros(points), np.zeros(points), np.zeros(three, int), np.zeros(three), np.zeros((*of, 4), int)
+    )
+
+
+def _work(code, line: _Axis, directions: int, together: int, real) -> machine_code.Work:
     size = line.area
     return code.Work(
-        rows=_lined_up((directions + 4, size + 2 * _margin(line, real)), real), nowhere=_lined_up((size,), real),
-        asked=_lined_up((3, size), real),
-        here=_cut_blocks(code, line, real), sent=_of_ghosts(line, real), own=np.zeros(directions, int), free=np.zeros(4, int),
+        rows=_lined_up((directions + 4 * together, size + 2 * _margin(line, real)), real), nowhere=_lined_up((size,), real),
+        asked=_lined_up((3, size), real), here=_cut_blocks(code, line, real), sent=_of_ghosts(line, together, real),
+        own=np.zeros(directions, int), free=np.zeros((together, 4), int), passing=np.zeros(directions, int),
+        count=np.zeros(together, int), length=np.zeros(together), weight=np.zeros(together),
         point=np.zeros(3), whole=np.zeros(3), form=np.zeros((code.ROWS + 1) * code.BLOCK),
-        picked=np.zeros(_most(line), np.uint32), at=np.zeros(code.BLOCK, np.uint32), way=_segments(code),
+        picked=np.zeros(_most(line), np.uint32), at=np.zeros(code.BLOCK, np.uint32), way=_segments(code, together),
     )  # fmt: skip
 
 
@@ -391,7 +400,7 @@ def _standing(code, line: _Axis, directions: int, real) -> machine_code.Standing
     return code.Standing(
         rows=np.zeros((directions, line.area), real), shift=np.zeros(directions, int), nowhere=np.zeros(1, real),
         hits=np.zeros((3, most), real), probes=np.zeros((3, most), real), picked=np.zeros((2, most), np.uint32),
-        here=_cut_blocks(code, line, real), sent=_of_ghosts(line, real), form=np.zeros((code.ROWS + 1) * code.BLOCK),
+        here=_cut_blocks(code, line, real), sent=_of_ghosts(line, 1, real)[0], form=np.zeros((code.ROWS + 1) * code.BLOCK),
         at=np.zeros(code.BLOCK, np.uint32), way=_segments(code),
     )  # fmt: skip
 
@@ -405,8 +414,8 @@ def _cut_blocks(code, line: _Axis, real) -> np.ndarray:
     return np.zeros(-(-most // code.BLOCK) * code.BLOCK * code.CUT_ROWS, real)
 
 
-def _of_ghosts(line: _Axis, real) -> np.ndarray:
-    return np.zeros(int(np.diff(line.ghosts.first).max()), real)
+def _of_ghosts(line: _Axis, together: int, real) -> np.ndarray:
+    return np.zeros((together, int(np.diff(line.ghosts.first).max())), real)
 
 
 def _most(line: _Axis) -> int:
@@ -445,7 +454,7 @@ def _planes(field: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _lined_up(shape: tuple[int, ...], real: np.dtype) -> np.ndarray:
-    """Zeros, of which each row begins with a line of cache, with a few more at its end: what is written is twice as fast then."""
+    """Zeros, of which each row begins with a line of cache, with a few more at its end: writing them takes half as long."""
     shape = (*shape[:-1], _whole_lines(shape[-1], real))
     size = int(np.prod(shape)) * real.itemsize
     memory = np.zeros(size + _LINE, np.uint8)

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 UNEVEN, EVEN, PATCHY = 0, 1, 2
 BLOCK = 128  # elements, or CUT voxels, that are worked on at a time
+TOGETHER = 4  # directions that pass a plane at the same time, forwards through a medium
 ROWS = 20  # numbers of an element in a block, and of a CUT voxel
 CUT_ROWS = 16
 
@@ -109,7 +110,7 @@ class Manner(NamedTuple):
 
 
 class Segments(NamedTuple):
-    """Where the rays of a direction are on their way through a plane."""
+    """Where the rays of a direction are on their way through a plane; in `Work` those of several, one after the other."""
 
     share: Any  # [3]
     begin: Any  # [3, 3]
@@ -122,19 +123,23 @@ class Segments(NamedTuple):
 class Work(NamedTuple):
     """A core's own memory, of any content."""
 
-    rows: Any  # [rows + 4, P + 2 margin] rays, both ends joined
+    rows: Any  # [rows + 4 together, P + 2 margin] rays, both ends joined
     nowhere: Any  # [P]
     asked: Any  # [3, P] of the rays before each segment (backwards)
     here: Any  # blocks of CUT voxels (see `cut`)
-    sent: Any  # [most ghosts in a plane]
+    sent: Any  # [together, most ghosts in a plane]
     own: Any  # [rows] which row holds the rays of each direction
-    free: Any  # [4] rows that hold none
+    free: Any  # [together, 4] rows that hold none
+    passing: Any  # [rows] directions that pass a plane
+    count: Any  # [together] their segments there
+    length: Any  # [together] their paths
+    weight: Any  # [together]
     point: Any  # [3]
     whole: Any  # [3]
     form: Any  # [(ROWS + 1) * BLOCK]
     picked: Any  # [most readers of a plane, or 1]
     at: Any  # [BLOCK]
-    way: Any  # Segments
+    way: Any  # Segments of all [together]
 
 
 class Standing(NamedTuple):

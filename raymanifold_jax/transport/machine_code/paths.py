@@ -8,6 +8,7 @@ import numba
 import numpy as np
 from numba.extending import overload, register_jitable
 
+from .arguments import Segments
 from .compiling import compiled, inlined
 
 
@@ -123,12 +124,19 @@ def chords(ways, n, step, width, wrap_v, way):
     return 3
 
 
+@inlined
+def of_one(way, g):
+    """Of several directions' segments, those of one."""
+    return Segments(way.share[g], way.begin[g], way.end[g], way.move[g], way.step[g], way.row[g])
+
+
 @compiled
 def join_ends(row, planes):
     """Planes are joined at both ends: what is before the first voxel is the last row, and the other way round."""
-    begin, width, size = planes.margin, planes.width, planes.height * planes.width
+    begin, width, end = planes.margin, planes.width, planes.margin + planes.height * planes.width
+    before, first, last, behind = row[begin - width : begin], row[begin:], row[end - width : end], row[end:]
     for i in range(width):
-        row[begin - width + i], row[begin + size + i] = row[begin + size - width + i], row[begin + i]
+        before[i], behind[i] = last[i], first[i]
 
 
 @compiled
