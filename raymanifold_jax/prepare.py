@@ -3,11 +3,12 @@
 Finding the surfaces, marking which rays hit them and balancing the exchange take as long as some sweeps each. A fit solves the
 same geometry with other values many times, and does this once.
 
-Public: `prepare`, `Prepared`.
+Public: `prepare`, `prepare_once`, `Prepared`.
 """
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Callable, Hashable
 from typing import Any
 
@@ -24,6 +25,10 @@ from .placement import known
 from .scene import Scene
 from .surfaces import Surfaces, find_surfaces
 
+_SMALL = 1 << 20  # voxels times bands, of which a solve keeps what it has made
+
+_latest: Callable[[], Prepared | None] = lambda: None
+
 
 class Prepared:
     """Surfaces and layout of a geometry; `reuse` keeps what was made for some values while they stay the same.
@@ -33,7 +38,7 @@ class Prepared:
 
     def __init__(self, surfaces: Surfaces, layout: Layout, once: bool = False):
         self.surfaces, self.layout = surfaces, layout
-        self._once = once
+        self._once, self._wanted = once, False
         self._kept: dict[Hashable, tuple[list[np.ndarray], Any, Any]] = {}
         self._partitions: dict[Mesh, Partition] = {}
 
@@ -45,9 +50,19 @@ class Prepared:
             self._partitions[mesh] = make_partition(self.layout, mesh)
         return self._partitions[mesh]
 
-    def bare(self) -> Prepared:
-        """The same without what `reuse` keeps."""
-        return Prepared(self.surfaces, self.layout)
+    def for_the_next(self) -> Prepared:
+        """What a later solve of this geometry may begin with: all of it or, where this was for one solve, what is bare."""
+        return Prepared(self.surfaces, self.layout) if self._once else self
+
+    def used_again(self) -> Prepared:
+        """Itself, which will not `forget` any more."""
+        self._wanted = True
+        return self
+
+    def forget(self) -> None:
+        """Let go what `reuse` keeps, if that was not used again."""
+        if not self._wanted:
+            self._kept.clear()
 
     def reuse(self, key: Hashable, values: Any, make: Callable[[], Any], alive: Any = None) -> Any:
         """`make()`, or what it gave before for the same `key` and equal arrays in `values`.
@@ -64,6 +79,20 @@ class Prepared:
             if not checks.is_traced(kept):
                 self._kept[key] = now, kept, alive
         return kept
+
+
+def prepare_once(scene: Scene) -> Prepared:
+    """For a solve that may be the only one of its geometry.
+
+    What it makes is kept where that is small, for `Solution.resolve` to answer at once; unless it does, until the next solve.
+    """
+    global _latest
+    small = int(np.prod(scene.lattice.shape)) * scene.bands <= _SMALL
+    prepared, before = prepare(scene, once=not small), _latest()
+    if before is not None:
+        before.forget()
+    _latest = weakref.ref(prepared)
+    return prepared
 
 
 def prepare(scene: Scene, once: bool = False) -> Prepared:

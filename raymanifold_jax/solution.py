@@ -119,8 +119,9 @@ class Solution(eqx.Module):
         """Solve for other lights, albedos, emissions or medium in the same geometry, from this solution on.
 
         What depends on the geometry alone is not done again, and the iteration starts from this light; the directions, the
-        scheme and `rtol` stay what they were unless `options`, which are those of `rm.solve`, say otherwise. The first call
-        also keeps, for those that follow, what a solve otherwise lets go (who sees whom; see `rm.solve`, `prepared`).
+        scheme and `rtol` stay what they were unless `options`, which are those of `rm.solve`, say otherwise. A solve of more
+        than a million voxels and bands lets go what it has made (who sees whom; see `rm.solve`, `prepared`), a smaller one when
+        another scene is solved; then the first call makes it anew. From then on it is kept.
 
         **Raises** `ValueError` for a scene with another lattice, other shapes or other kinds of sides.
         """

@@ -32,7 +32,7 @@ from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
 from .optimistix_solver import OptimistixFixedPoint
 from .placement import check_agreement, restored, stored
-from .prepare import Prepared, prepare
+from .prepare import Prepared, prepare_once
 from .programs import program
 from .progress import Progress, make_progress
 from .quadrature import Quadrature, for_scene
@@ -108,8 +108,7 @@ def solve(
     meter = make_progress(progress)
     with meter:
         meter.start(f"solve {scene.summary()}")
-        kept = prepared is not None
-        prepared = prepare(scene, once=True) if prepared is None else prepared
+        prepared = prepare_once(scene) if prepared is None else prepared.used_again()
         surfaces = prepared.surfaces
         layout = prepared.layout_on(mesh if cube is None else None)
         with worked_out_now():
@@ -139,7 +138,7 @@ def solve(
             again = lambda make, near: prepared.reuse(("certificate", near, *key), values, make, quadrature)
         first = None if start is None or nodes is not None else stored(layout, _sent(start, stuff))
         iteration, chosen = _iterate(system, surfaces, again, float(rtol), chosen, max_sweeps, meter, checkpoint, first)
-        hidden = _Hidden(surfaces, prepared if kept else prepared.bare(), quadrature, options)
+        hidden = _Hidden(surfaces, prepared.for_the_next(), quadrature, options)
         solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes, chosen, hidden)
     if throw and not solution.converged and solution.ending != "as asked":
         raise RuntimeError(f"solve: {solution.result}")
@@ -178,12 +177,16 @@ def _check_start(scene: Scene, start: Solution, bounces: int | None, checkpoint:
 
 def _sent(start: Solution, stuff: Materials) -> Light | None:
     """What surfaces and medium would send of a solution's light; None if its bands are others."""
-    total = Light(
-        (start.diffuse_irradiance + start.sun_irradiance) / jnp.pi, (start.diffuse_fluence + start.sun_fluence) / (4 * jnp.pi)
-    )
-    if total.elements.shape != stuff.albedo.shape or checks.is_traced((total, stuff)):
+    found = start.diffuse_irradiance, start.sun_irradiance, start.diffuse_fluence, start.sun_fluence
+    if found[0].shape != stuff.albedo.shape or checks.is_traced((found, stuff)):
         return None
+    total = _in_all(*found)
     return stuff.reflected(total if stuff.scattering_albedo is not None else Light(total.elements))
+
+
+@program
+def _in_all(diffuse_irradiance: Array, sun_irradiance: Array, diffuse_fluence: Array, sun_fluence: Array) -> Light:
+    return Light((diffuse_irradiance + sun_irradiance) / jnp.pi, (diffuse_fluence + sun_fluence) / (4 * jnp.pi))
 
 
 def _iterate(

@@ -1,6 +1,7 @@
 """The iteration: its certified bound, its energy balance, what it says when it stops, and that solutions are well-formed."""
 
 import functools
+import sys
 
 import jax
 import numpy as np
@@ -220,3 +221,30 @@ def test_resolve_goes_on_from_the_light_that_was_found(fog):
     # Twice as many bands: nothing to begin with, and still right.
     coloured = first.resolve(scene(0.8, (1.0, 0.5, 0.2)))
     assert coloured.converged and coloured.fluence.shape[-1] == 3
+
+
+def test_a_small_solve_keeps_its_sweeps_until_the_next(monkeypatch):
+    """And for good once they were used again; a large one keeps none: each time sweeps are made is counted."""
+    solve, prepare = (sys.modules[f"raymanifold_jax.{name}"] for name in ("solve", "prepare"))
+    made, make = [], solve.make_transport
+    monkeypatch.setattr(solve, "make_transport", lambda *a, **k: made.append(1) or make(*a, **k))
+    quadrature, ball = rm.quadrature.fibonacci(24), rm.Solid(problems.BALL, 0.5)
+    scene = lambda sky: rm.Scene(problems.cube(6), [ball], lights=[rm.Sky(sky)])
+
+    def times(call):
+        made.clear()
+        return call(), len(made)
+
+    first, count = times(lambda: rm.solve(scene(1.0), quadrature))
+    assert count == 1
+    rm.solve(scene(1.0), quadrature)
+    second, count = times(lambda: first.resolve(scene(1.5)))
+    assert count == 1  # another solve came in between
+    rm.solve(scene(1.0), quadrature)
+    assert times(lambda: second.resolve(scene(2.0)))[1] == 0  # now they stay
+    third = rm.solve(scene(1.0), quadrature)
+    assert times(lambda: third.resolve(scene(1.5)))[1] == 0
+    monkeypatch.setattr(prepare, "_SMALL", 6**3 - 1)
+    large = rm.solve(scene(1.0), quadrature)
+    assert times(lambda: large.resolve(scene(1.5)))[1] == 1
+    assert times(lambda: large.resolve(scene(2.0)))[1] == 0

@@ -128,7 +128,7 @@ def sweep(
 
         def run(part: np.ndarray):
             sums = [np.zeros((bands, len(r.cell))) for r in readers]
-            voxels, directions = _lined_up((line.shape[0], bands, line.area), real), min(how.rows, len(part))
+            voxels, directions = _lined_up((line.shape[0] * manner.fluence, bands, line.area), real), min(how.rows, len(part))
             known = part, line.ways, planes, cut, line.ghosts, hits, probes, light, how
             if volume is None:
                 code.in_vacuum(*known, _standing(code, line, directions, real), *sums, voxels)
@@ -139,11 +139,12 @@ def sweep(
         parts = on_cores(run, _shared(_lit(layout, line, axis, inflow)) if dark else line.parts)
 
         def add_up() -> None:
-            for sums, voxels in parts:
-                for of_kind, of_readers in zip(readers, sums, strict=True):
-                    at_elements[:] += [np.bincount(of_kind.element, band, layout.elements) for band in of_readers]
-                if manner.fluence:
-                    in_voxels[:] += _from_planes(voxels, axis, line.shape)
+            # Parts are added to one another where they are, which is quicker than to turn each.
+            sums, voxels = functools.reduce(_added, parts)
+            for of_kind, of_readers in zip(readers, sums, strict=True):
+                at_elements[:] += [np.bincount(of_kind.element, band, layout.elements) for band in of_readers]
+            if manner.fluence:
+                in_voxels[:] += _from_planes(voxels, axis, line.shape)
 
         return add_up
 
@@ -192,12 +193,12 @@ def unsweep(
         parts = on_cores(run, line.parts)
 
         def add_up() -> None:
-            for back in parts:
-                for values, at in ((back.cut, line.at_cut), (back.ghost, line.at_ghost)):
-                    exitance[:] += _scattered(values, layout, at)
-                found = [back.source, *(back.slopes[AXES[axis].index(a)] for a in range(3))]
-                for field, of_planes in zip(fields, found, strict=False):
-                    field += _from_planes(of_planes, axis, line.shape)
+            back = functools.reduce(_added, parts)
+            for values, at in ((back.cut, line.at_cut), (back.ghost, line.at_ghost)):
+                exitance[:] += _scattered(values, layout, at)
+            found = [back.source, *(back.slopes[AXES[axis].index(a)] for a in range(3))]
+            for field, of_planes in zip(fields, found, strict=False):
+                field += _from_planes(of_planes, axis, line.shape)
 
         return add_up
 
@@ -205,6 +206,11 @@ def unsweep(
     give_back_freed(real.itemsize * bands * int(np.prod(layout.shape)))
     source = as_jax(layout.from_padded(fields[0])) if medium else None
     return as_jax(exitance, real), source, tuple(map(as_jax, fields[1:])) if sloped else None
+
+
+def _added(one: Any, other: Any) -> Any:
+    """The arrays of one tree, with those of another added to them in place."""
+    return jax.tree.map(np.ndarray.__iadd__, one, other)
 
 
 class Listed(NamedTuple):
