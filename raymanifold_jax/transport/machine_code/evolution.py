@@ -122,18 +122,6 @@ def forwards(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wor
                     put_cut(cut, k, sums, here)
 
 
-@compiled
-def _moved_back(row, to, move, planes, size):
-    """What was asked of the rays after a move, of the rays before it."""
-    margin = planes.margin
-    if planes.wrap_v and abs(move) == 1 and planes.width > 1:
-        turn(row, to, -move, planes)
-        return
-    for i in range(size):
-        to[margin + i] = row[margin + i + move]
-    join_ends(to, planes)
-
-
 def backwards(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_hits, of_probes, in_voxels, back):
     """The transpose of `forwards`: adds to `back` what weights of its three sums ask of what was sent."""
     count, bands, size = planes.even.shape[0], planes.even.shape[1], planes.height * planes.width
@@ -165,9 +153,10 @@ def backwards(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_
                             there = length, back, cut.first[k], planes.spacing, manner, work
                             ask(False, hits, ways, n, k, c, segments, way, *there, of_hits)
                             ask(True, probes, ways, n, k, c, segments, way, *there, of_probes)
+                        move = 0  # from the voxels that rays come to after a segment to those they left
                         for number in range(segments - 1, -1, -1):
                             after, before, ask_of = rows[own[b]], rows[free[0]], asked[number]
-                            gone, come = after[margin : margin + size], before[margin : margin + size]
+                            gone, come = after[margin + move : margin + move + size], before[margin : margin + size]
                             weight = ways.weight[n]
                             if not dark:
                                 of_plane = gone, come, ask_of, wanted, back, manner, work, weight
@@ -176,8 +165,8 @@ def backwards(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_
                             back_ghosts(ghosts, k, c, gone, come, ask_of, back.ghost)
                             join_ends(before, planes)
                             own[b], free[0] = free[0], own[b]
-                            move = way.move[number]
-                            if move:
-                                _moved_back(rows[own[b]], rows[free[0]], move, planes, size)
-                                own[b], free[0] = free[0], own[b]
+                            move = way.move[number]  # none before the first
+                            if planes.wrap_v and abs(move) == 1 and planes.width > 1:
+                                turn(rows[own[b]], rows[free[0]], -move, planes)
+                                own[b], free[0], move = free[0], own[b], 0
                     give_cut(cut, k, c, back, manner, here)
