@@ -139,12 +139,11 @@ def sweep(
         parts = on_cores(run, _shared(_lit(layout, line, axis, inflow)) if dark else line.parts)
 
         def add_up() -> None:
-            # Parts are added to one another where they are, which is quicker than to turn each.
-            sums, voxels = functools.reduce(_added, parts)
-            for of_kind, of_readers in zip(readers, sums, strict=True):
-                at_elements[:] += [np.bincount(of_kind.element, band, layout.elements) for band in of_readers]
-            if manner.fluence:
-                in_voxels[:] += _from_planes(voxels, axis, line.shape)
+            for sums, voxels in _as_one(parts):
+                for of_kind, of_readers in zip(readers, sums, strict=True):
+                    at_elements[:] += [np.bincount(of_kind.element, band, layout.elements) for band in of_readers]
+                if manner.fluence:
+                    in_voxels[:] += _from_planes(voxels, axis, line.shape)
 
         return add_up
 
@@ -193,12 +192,12 @@ def unsweep(
         parts = on_cores(run, line.parts)
 
         def add_up() -> None:
-            back = functools.reduce(_added, parts)
-            for values, at in ((back.cut, line.at_cut), (back.ghost, line.at_ghost)):
-                exitance[:] += _scattered(values, layout, at)
-            found = [back.source, *(back.slopes[AXES[axis].index(a)] for a in range(3))]
-            for field, of_planes in zip(fields, found, strict=False):
-                field += _from_planes(of_planes, axis, line.shape)
+            for back in _as_one(parts):
+                for values, at in ((back.cut, line.at_cut), (back.ghost, line.at_ghost)):
+                    exitance[:] += _scattered(values, layout, at)
+                found = [back.source, *(back.slopes[AXES[axis].index(a)] for a in range(3))]
+                for field, of_planes in zip(fields, found, strict=False):
+                    field += _from_planes(of_planes, axis, line.shape)
 
         return add_up
 
@@ -208,9 +207,15 @@ def unsweep(
     return as_jax(exitance, real), source, tuple(map(as_jax, fields[1:])) if sloped else None
 
 
-def _added(one: Any, other: Any) -> Any:
-    """The arrays of one tree, with those of another added to them in place."""
-    return jax.tree.map(np.ndarray.__iadd__, one, other)
+def _as_one(parts: Iterable[Any]) -> list[Any]:
+    """The arrays of all trees added up in those of the first, which is quicker than to turn each; nothing of none."""
+    whole: list[Any] = []
+    for part in parts:
+        if whole:
+            jax.tree.map(np.ndarray.__iadd__, whole[0], part)
+        else:
+            whole.append(part)
+    return whole
 
 
 class Listed(NamedTuple):
