@@ -1,5 +1,7 @@
 """Vacuum: bounces by links are those of sweeps; and sweeps in parts, one for each core, are whole sweeps."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,8 +33,10 @@ def test_a_bounce_by_links_is_a_sweep(x64, sides):
     transport = make_transport(prepared.layout, quadrature, None, 2, area=area)
     assert transport.links is not None
     light = Light(jnp.asarray(np.random.default_rng(0).uniform(size=(2, prepared.layout.elements))))
-    # With `fluence` it is swept.
-    np.testing.assert_allclose(transport(light, fluence=False).elements, transport(light).elements, atol=1e-13)
+    linked, swept = transport(light), dataclasses.replace(transport, links=None)(light)
+    np.testing.assert_allclose(linked.elements, swept.elements, atol=1e-13)
+    np.testing.assert_allclose(linked.voxels, swept.voxels, atol=1e-13)
+    np.testing.assert_array_equal(transport(light, fluence=False).elements, linked.elements)
     x, y = light.elements, light.elements[::-1, ::-1]
     forth = jnp.vdot(y, transport(Light(x), fluence=False).elements)
     assert float(jnp.vdot(transport.transposed(Light(y)).elements, x)) == pytest.approx(float(forth), rel=1e-13)

@@ -5,6 +5,7 @@ Numbers in solids are left out: nobody reads them, and rays there are not the sa
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 import threading
@@ -157,6 +158,15 @@ def test_without_fluence():
     elements, voxels = native.sweep(manner, *given)
     assert voxels is None
     _close(elements, derivative._sweep_program(manner, *given)[0], case.free)
+
+
+@pytest.mark.parametrize("name", ["vacuum", "thin fog"])
+def test_without_elements(name):
+    case = _Case(_SCENES[name]())
+    given = *case.known, case.elements, case.voxels, None, case.inflow
+    elements, voxels = native.sweep(dataclasses.replace(case.manner, elements=False), *given)
+    assert not elements.any()
+    np.testing.assert_array_equal(voxels, native.sweep(case.manner, *given)[1])
 
 
 @pytest.mark.parametrize(

@@ -41,11 +41,15 @@ Sent = tuple[Float[Array, "C E"], Field | None, Slopes | None]
 
 @dataclasses.dataclass(frozen=True)
 class Manner:
-    """What a sweep's program is made for; `thin` and `onward` as in `SweptMedium`."""
+    """What a sweep's program is made for; `thin` and `onward` as in `SweptMedium`.
+
+    `fluence`: with sums in the voxels. Without `elements` those at elements mean nothing: nobody asks for them.
+    """
 
     thin: bool
     onward: bool = False
     fluence: bool = True
+    elements: bool = True
 
 
 def swept(

@@ -115,8 +115,9 @@ def sweep(
     dark = not sent.any() and not any(np.asarray(field).any() for field in (volume, *(slopes or ())) if field is not None)
 
     def begin(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> Callable[[], None]:
-        planes, cut, hits, probes = arguments
-        readers = hits, probes
+        planes, cut, *readers = arguments
+        if not manner.elements:
+            readers = [r._replace(runs=np.zeros_like(r.runs)) for r in readers]
         light = _contiguous(code.Light(
             source=np.zeros((1, bands, 1), real) if volume is None else _planes(volume, axis),
             slopes=tuple(_planes(np.asarray(slopes[a]), axis) if slopes else np.zeros((1, 1, 1), real) for a in AXES[axis]),
@@ -129,7 +130,7 @@ def sweep(
         def run(part: np.ndarray):
             sums = [np.zeros((bands, len(r.cell))) for r in readers]
             voxels, directions = _lined_up((line.shape[0] * manner.fluence, bands, line.area), real), min(how.rows, len(part))
-            known = part, line.ways, planes, cut, line.ghosts, hits, probes, light, how
+            known = part, line.ways, planes, cut, line.ghosts, *readers, light, how
             if volume is None:
                 code.in_vacuum(*known, _standing(code, line, directions, real), *sums, voxels)
             else:
