@@ -92,8 +92,9 @@ def first_flight(
         if isinstance(light, PointLight):
             swept = swept + stored(layout, _from_point(scene, surfaces, light))
     zero = zeros_like(swept)
-    suns = [_from_sun(scene, surfaces, layout, light, materials, prepared) for light in scene.lights if isinstance(light, Sun)]
-    return Direct(sun=sum(suns, start=zero), rest=swept, brightest=brightest(scene, None if sky is None else sky.radiance))
+    suns = [light for light in scene.lights if isinstance(light, Sun)]
+    beams = [_from_sun(scene, surfaces, layout, sun, materials, prepared, number) for number, sun in enumerate(suns)]
+    return Direct(sun=sum(beams, start=zero), rest=swept, brightest=brightest(scene, None if sky is None else sky.radiance))
 
 
 def brightest(scene: Scene, sky: Array | None) -> Float[Array, ""]:
@@ -146,6 +147,7 @@ def _from_sun(
     sun: Sun,
     materials: Materials,
     prepared: Prepared | None = None,
+    number: int = 0,
 ) -> Light:
     side = (np.arange(_SUN_OFFSETS) + 0.5) / _SUN_OFFSETS
     offsets = np.stack(np.meshgrid(side, side, indexing="ij"), -1).reshape(-1, 2)
@@ -153,8 +155,10 @@ def _from_sun(
     direction = np.asarray(sun.direction)
     beam = Quadrature(np.tile(direction, (count, 1)), np.full(count, 1 / count), offsets, "sun")
     make = lambda: _beam_transport(layout, beam, materials.extinction, scene.bands)
-    key = ("sun", *direction.tolist(), scene.bands, layout.shapes.mesh if isinstance(layout, Partition) else None)
-    transport = make() if prepared is None else prepared.reuse(key, materials.extinction, make)
+    key = ("sun", number, scene.bands, layout.shapes.mesh if isinstance(layout, Partition) else None)
+    # Of many suns a solve that may be the only one keeps one.
+    alone = prepared is None or (number > 0 and not prepared.for_good)
+    transport = make() if alone else prepared.reuse(key, (direction, materials.extinction), make)
     images = layout.unfolding.images()
     # Only the scene itself is lit; a mirror image of it gets what mirrors reflect.
     here = np.array([float(np.all(signs > 0)) for _, signs in images], real_dtype())

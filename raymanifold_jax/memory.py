@@ -2,14 +2,14 @@
 
 The need in bytes, with V voxels (a layer of ghosts included), C bands, E surface elements and D directions:
 
-    need = PROGRAM + C BAND + 4 V (GEOMETRY + C (FIELDS + cores)) + E (ELEMENT + C D) + links
+    need = PROGRAM + C BAND + 4 V (GEOMETRY + C (FIELDS + cores)) + 4 P cores ROWS + E (ELEMENT + C D) + links
 
-C D: the bits that say which directions hit an element. Without a medium there are also links from element to element (see
-`transport.links`), at most LINKS E D and usually half of that, if these are not more than MOST_LINKS. Of fields that are LARGE
-only HELD are there at a time, as what is freed is given back (`give_back_freed`). Where sweeps are XLA's (see
-`transport.native`), it is not, there are SWEEPS bytes and BUFFERS words a voxel more, and the links are longer on their way.
-The constants are for 32-bit numbers; with them the peaks of ring and three balls (32 to 160 cubed) and of the Cornell box (32)
-come out within 20 %, of first and of later starts.
+P is the voxels of the largest plane, of which each core keeps rays. C D: the bits that say which directions hit an element.
+Without a medium there are also links from element to element (see `transport.links`), at most LINKS E D and usually half of
+that, if these are not more than MOST_LINKS. Of fields that are LARGE only HELD are there at a time, as what is freed is given
+back (`give_back_freed`). Where sweeps are XLA's (see `transport.native`), it is not, there are SWEEPS bytes and BUFFERS words
+a voxel more, and the links are longer on their way. The constants are for 32-bit numbers; with them the peaks of ring and
+three balls (32 to 160 cubed) and of the Cornell box (32) come out within 20 %, of first and of later starts.
 
 Public names: `estimate_memory`, `available_memory`, `check_memory`, `give_back_freed`, `gigabytes`.
 """
@@ -28,6 +28,7 @@ GEOMETRY = 30  # words a voxel: planes, the samples of the signed distance, copi
 FIELDS_VACUUM = 11  # words a voxel and band: sums of a sweep, fluence of sun, sky and bounces
 FIELDS_MEDIUM = 65  # the same, coefficients, source, the multigrid's, and the iteration's unknowns of many sweeps
 BUFFERS = 32  # words a voxel
+ROWS = 20  # planes of rays: of four directions and what they need while they pass four at a time
 LINKS = 13  # bytes an element and direction, half of which come from behind it, while they are sorted; 8 of 20 remain
 MOST_LINKS = 1 << 30  # bytes: more are not made
 LARGE = 1 << 22  # bytes of an array: smaller ones are not worth giving back
@@ -56,7 +57,8 @@ def estimate_memory(scene_shape: Shape, bands: int, directions: int, medium: boo
     elif _trim() is not None and 4 * bands * nx * ny * nz >= LARGE:
         fields *= HELD
     voxels = (nx + 2) * (ny + 2) * (nz + 2)
-    return program + bands * BAND + int(4 * voxels * fields) + elements * (ELEMENT + bands * directions) + links
+    rays = cores * ROWS * voxels // (min(scene_shape) + 2)
+    return program + bands * BAND + int(4 * (voxels * fields + rays)) + elements * (ELEMENT + bands * directions) + links
 
 
 def available_memory() -> int | None:

@@ -32,7 +32,7 @@ from .memory import check_memory
 from .operator import Light, Materials, Transport, make_transport, materials
 from .optimistix_solver import OptimistixFixedPoint
 from .placement import check_agreement, restored, stored
-from .prepare import Prepared, prepare_once
+from .prepare import Prepared, let_go, prepare_once
 from .programs import program
 from .progress import Progress, make_progress
 from .quadrature import Quadrature, for_scene
@@ -104,6 +104,8 @@ def solve(
     chosen = solver if bounces is None else _orders(bounces, scene, checkpoint)
     cube = scheme if isinstance(scheme, LightRayCube) else None
     quadrature = for_scene(scene) if quadrature is None else quadrature
+    if prepared is None:
+        let_go()
     check_memory(scene.lattice.shape, scene.bands, len(quadrature), scene.medium is not None)
     meter = make_progress(progress)
     with meter:
@@ -138,7 +140,9 @@ def solve(
             again = lambda make, near: prepared.reuse(("certificate", near, *key), values, make, quadrature)
         first = None if start is None or nodes is not None else stored(layout, _sent(start, stuff))
         iteration, chosen = _iterate(system, surfaces, again, float(rtol), chosen, max_sweeps, meter, checkpoint, first)
-        hidden = _Hidden(surfaces, prepared.for_the_next(), quadrature, options)
+        if not prepared.keeps:
+            prepared.forget()  # blocks on a mesh
+        hidden = _Hidden(surfaces, prepared, quadrature, options)
         solution = _finish(scene, surfaces, quadrature, stuff, iteration, nodes, chosen, hidden)
     if throw and not solution.converged and solution.ending != "as asked":
         raise RuntimeError(f"solve: {solution.result}")

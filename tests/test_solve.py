@@ -1,6 +1,7 @@
 """The iteration: its certified bound, its energy balance, what it says when it stops, and that solutions are well-formed."""
 
 import functools
+import pickle
 import sys
 
 import jax
@@ -244,7 +245,23 @@ def test_a_small_solve_keeps_its_sweeps_until_the_next(monkeypatch):
     assert times(lambda: second.resolve(scene(2.0)))[1] == 0  # now they stay
     third = rm.solve(scene(1.0), quadrature)
     assert times(lambda: third.resolve(scene(1.5)))[1] == 0
+    copy = pickle.loads(pickle.dumps(third))
+    assert times(lambda: copy.resolve(scene(1.5)))[1] == 1  # a copy of a solution has none of that
     monkeypatch.setattr(prepare, "_SMALL", 6**3 - 1)
     large = rm.solve(scene(1.0), quadrature)
     assert times(lambda: large.resolve(scene(1.5)))[1] == 1
     assert times(lambda: large.resolve(scene(2.0)))[1] == 0
+
+
+def test_suns_that_move_do_not_pile_up():
+    """What is kept of a sun that moved is gone; of many suns a first solve keeps one."""
+    ball, sun = rm.Solid(problems.BALL, 0.5), lambda x, y: rm.Sun((x, y, -1.0), 1.0)
+    scene = lambda *suns: rm.Scene(problems.cube(6), [ball], lights=list(suns))
+    of_suns = lambda solution: sum(key[0] == "sun" for key in solution._hidden.prepared._kept)
+    first = rm.solve(scene(sun(0.1, 0.2), sun(0.3, 0.1), sun(0.2, 0.2)), rm.quadrature.fibonacci(24))
+    assert of_suns(first) == 1
+    second = first.resolve(scene(sun(0.1, 0.2), sun(0.3, 0.1)))
+    third = second.resolve(scene(sun(0.2, 0.2), sun(0.4, 0.1)))
+    assert of_suns(second) == of_suns(third) == 2
+    alone = rm.solve(scene(sun(0.2, 0.2), sun(0.4, 0.1)), rm.quadrature.fibonacci(24))
+    np.testing.assert_allclose(third.surfaces.irradiance, alone.surfaces.irradiance, atol=2e-4)

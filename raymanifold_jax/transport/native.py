@@ -362,7 +362,7 @@ def _lines(manner: Any, layout: Layout, ordinates, extinction, bands: int, slope
     for axis, line in zip(used, on_cores(lambda axis: _axis(layout, ordinates[axis], axis), used), strict=True):
         if line.parts:
             medium = _medium(layout, line, axis, extinction, bands, real)
-            arguments = _arguments(code, layout, line, medium, axis)
+            arguments = _arguments(code, layout, line, medium, axis, real)
             yield axis, line, _contiguous(arguments), _manner(code, manner, medium, sloped, line, real)
 
 
@@ -435,10 +435,10 @@ def _most(line: _Axis) -> int:
     return 7 + max(1, *(int(np.diff(r.first[r.runs]).max(initial=0)) for r in (line.hits, line.probes)))
 
 
-def _arguments(code, layout: Layout, line: _Axis, medium: _Medium, axis: int) -> tuple:
+def _arguments(code, layout: Layout, line: _Axis, medium: _Medium, axis: int, real: np.dtype) -> tuple:
     _, height, width = line.shape
     wrap_v = layout.pad[AXES[axis][2]] == 0
-    margin, spacing = _margin(line, np.dtype(layout.plane.dtype)), float(layout.spacing)
+    margin, spacing = _margin(line, real), float(layout.spacing)
     planes = code.Planes(height, width, margin, wrap_v, spacing, medium.even, medium.depth, medium.extinction)
     readers = (
         r._replace(even=even, depth=depth, extinction=each)

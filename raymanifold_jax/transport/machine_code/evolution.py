@@ -24,10 +24,11 @@ def most_laps(ways, batch):
 @compiled
 def begin_batch(work):
     rows, most = work.rows, len(work.own)
-    for b in range(most):
-        work.own[b] = b
+    for b in range(len(rows)):
         for i in range(rows.shape[1]):
             rows[b, i] = 0
+    for b in range(most):
+        work.own[b] = b
     for g in range(len(work.free)):
         for i in range(4):
             work.free[g, i] = most + 4 * g + i
