@@ -157,8 +157,10 @@ def _from_sun(
     make = lambda: _beam_transport(layout, beam, materials.extinction, scene.bands)
     key = ("sun", number, scene.bands, layout.shapes.mesh if isinstance(layout, Partition) else None)
     # Of many suns a solve that may be the only one keeps one.
-    alone = prepared is None or (number > 0 and not prepared.for_good)
-    transport = make() if alone else prepared.reuse(key, (direction, materials.extinction), make)
+    if prepared is None or (number > 0 and not prepared.for_good):
+        transport = make()
+    else:
+        transport = prepared.reuse(key, (direction, materials.extinction), make)
     images = layout.unfolding.images()
     # Only the scene itself is lit; a mirror image of it gets what mirrors reflect.
     here = np.array([float(np.all(signs > 0)) for _, signs in images], real_dtype())
