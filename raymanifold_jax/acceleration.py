@@ -44,6 +44,7 @@ from .transport.slopes import flattening
 _FREE_PATH = 4.0  # times the distance to the nearest surface, where nothing else ends a path
 _ENOUGH = 0.05  # of the residual may be left: GMRES corrects the rest
 _MOST = 30  # steps of conjugate gradients
+_WHOLE = 1 - 1e-4  # free share of a voxel that no surface cuts: a sum, which rounding may leave below 1
 _DAMPING = 0.8  # of Jacobi's smoothing
 _SMOOTHINGS = 2  # before and after a coarser level
 
@@ -316,7 +317,7 @@ def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodi
     total = depth + ends
     straight = jnp.zeros_like(depth)
     if sloped:
-        straight = jnp.where((scattering > 0) & (free == 1), flattening(depth, scattering), 0.0)
+        straight = jnp.where((scattering > 0) & (free > _WHOLE), flattening(depth, scattering), 0.0)
     links, bends = [], []
     for axis in (1, 2, 3):
         next_to = lambda field, axis=axis: jnp.roll(field, -1, axis)
