@@ -38,9 +38,9 @@ class Prepared:
     One that `keeps` nothing lets go what a solve has no more use for, until it is used again.
     """
 
-    def __init__(self, surfaces: Surfaces, layout: Layout, keeps: bool = True, for_good: bool = True):
+    def __init__(self, surfaces: Surfaces, layout: Layout):
         self.surfaces, self.layout = surfaces, layout
-        self.keeps, self.for_good = keeps, for_good
+        self.keeps = self.for_good = True
         self._kept: dict[Hashable, tuple[list[np.ndarray], Any, Any]] = {}
         self._partitions: dict[Mesh, Partition] = {}
 

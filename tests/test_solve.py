@@ -1,8 +1,8 @@
 """The iteration: its certified bound, its energy balance, what it says when it stops, and that solutions are well-formed."""
 
 import functools
+import importlib
 import pickle
-import sys
 
 import jax
 import numpy as np
@@ -226,7 +226,7 @@ def test_resolve_goes_on_from_the_light_that_was_found(fog):
 
 def test_a_small_solve_keeps_its_sweeps_until_the_next(monkeypatch):
     """And for good once they were used again; a large one keeps none: each time sweeps are made is counted."""
-    solve, prepare = (sys.modules[f"raymanifold_jax.{name}"] for name in ("solve", "prepare"))
+    solve, prepare = (importlib.import_module(f"raymanifold_jax.{name}") for name in ("solve", "prepare"))
     made, make = [], solve.make_transport
     monkeypatch.setattr(solve, "make_transport", lambda *a, **k: made.append(1) or make(*a, **k))
     quadrature, ball = rm.quadrature.fibonacci(24), rm.Solid(problems.BALL, 0.5)
