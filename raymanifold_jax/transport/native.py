@@ -117,7 +117,7 @@ def sweep(
     def begin(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> Callable[[], None]:
         planes, cut, *readers = arguments
         if not manner.elements:
-            readers = [r._replace(runs=np.zeros_like(r.runs)) for r in readers]
+            readers = [r._replace(runs=np.zeros_like(r.runs), alone=np.zeros_like(r.alone)) for r in readers]
         light = _contiguous(code.Light(
             source=np.zeros((1, bands, 1), real) if volume is None else _planes(volume, axis),
             slopes=tuple(_planes(np.asarray(slopes[a]), axis) if slopes else np.zeros((1, 1, 1), real) for a in AXES[axis]),
@@ -601,15 +601,21 @@ def _readers(
     face = np.array([np.asarray(values)[used] for values in (*reads.plane, reads.height)])
     keys = np.array([*face, cut, plane])
     order = np.lexsort(keys)
+    begins = _runs(keys[:, order], cut[order])
+    # Those that are runs of their own come after all others of their plane.
+    alone = np.repeat(sizes := np.diff(begins, append=len(order)), sizes) == 1
+    order = order[np.lexsort((alone, plane[order]))]
     keys, cut = keys[:, order], cut[order]
-    changes = np.any(keys[:, 1:] != keys[:, :-1], axis=0) | (cut[1:] >= 0)
-    begins = np.nonzero(np.concatenate([[len(order) > 0], changes]))[0]
+    begins = _runs(keys, cut)
+    several, of_runs = np.diff(begins, append=len(order)) > 1, plane[order][begins]
     count = len(reads.first_tile) - 1
     planes = np.zeros((4, len(order)), face.dtype)
     planes[0] = 1.0
     planes[:, cut >= 0] = cells.plane[:, cut[cut >= 0]]
+    runs = np.searchsorted(of_runs, np.arange(count + 1))
     return code.Readers(
-        runs=np.searchsorted(plane[order][begins], np.arange(count + 1)),
+        runs=runs,
+        alone=runs[:-1] + np.bincount(of_runs[several], minlength=count),
         first=np.append(begins, len(order)),
         face=face[:4, order],
         plane=planes,
@@ -622,6 +628,12 @@ def _readers(
         depth=np.zeros((1, 0)),
         extinction=np.zeros((1, 0)),
     )
+
+
+def _runs(keys: np.ndarray, cut: np.ndarray) -> np.ndarray:
+    """Where runs of readers with the same keys begin."""
+    changes = np.any(keys[:, 1:] != keys[:, :-1], axis=0) | (cut[1:] >= 0)
+    return np.nonzero(np.concatenate([[keys.shape[1] > 0], changes]))[0]
 
 
 def _to_bytes(of_readers: np.ndarray) -> np.ndarray:

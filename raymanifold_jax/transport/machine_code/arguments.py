@@ -49,10 +49,11 @@ class Cells(NamedTuple):
 class Readers(NamedTuple):
     """Elements that read voxels (see `layout.Reads`), plane by plane, in runs that have the same surface.
 
-    Those in CUT voxels, whose surfaces are hardly ever the same, are runs of their own.
+    Those in CUT voxels, whose surfaces are hardly ever the same, are runs of their own, behind the others of their plane.
     """
 
     runs: Any  # [K + 1] runs of plane k: runs[k] to runs[k + 1]
+    alone: Any  # [K] of which those from alone[k] on are of one reader each
     first: Any  # [R + 1] readers of run r: first[r] to first[r + 1]
     face: Any  # [4, M] offset and normal of their surface
     plane: Any  # [4, M] and of that in their voxel; (1, 0, 0, 0) where there is none

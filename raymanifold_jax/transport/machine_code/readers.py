@@ -214,21 +214,13 @@ def _paths(form, size, to, b, s, share, length, spacing, limit, onward, sloped):
 
 
 @inlined
-def forms_of(paths, readers, ways, n, c, picked, depth, count, way, length, spacing, manner, form):
-    """The forms of the `picked` readers, times cosine and weight of the direction.
-
-    As the mean of free `paths` or else of hits. All have the extinction `depth`, or each its own if that is negative.
-    """
+def forms_of(paths, readers, ways, n, c, picked, count, way, length, spacing, manner, form):
+    """The forms of the `picked` readers, times cosine and weight of the direction: as the mean of free `paths` or else of hits."""
     size = len(picked)
     _load(paths, readers, ways, n, picked, manner, form)
     if manner.medium:
         take(form[_HEIGHT * BLOCK : (_HEIGHT + 1) * BLOCK], readers.height, picked)
-        of_each = form[_DEPTH * BLOCK : (_DEPTH + 1) * BLOCK]
-        if depth < 0:
-            take(of_each, readers.extinction[c], picked)
-        else:
-            for i in range(size):
-                of_each[i] = depth
+        take(form[_DEPTH * BLOCK : (_DEPTH + 1) * BLOCK], readers.extinction[c], picked)
     for number in range(count):
         share, to = way.share[number], np.uintp(number) * np.uintp(BLOCK)
         if share <= 0:
@@ -267,18 +259,46 @@ def _finish(form, size, manner):
                 form[j + of_row] *= form[j + _OF]
 
 
-@register_jitable
-def shared(readers, r, c, manner):
-    """Whether all of a run have the same form, but for the marks. Those in CUT voxels are runs of their own."""
-    return readers.first[r + 1] > readers.first[r] + 1 and (not manner.medium or readers.even[c, r])
+@compiled
+def _any_marked(bits, n, first, last):
+    for byte in range(first >> 3, (last + 7) >> 3):
+        if _marks_within(bits, n, byte, first, last) != 0:
+            return True
+    return False
 
 
 @register_jitable
-def next_block(readers, r, end, c, manner):
-    """The run behind those from r on that do not share forms."""
-    while r < end and not shared(readers, r, c, manner):
+def _even(readers, r, c, manner):
+    """Whether all of a run have the same form, but for the marks."""
+    return not manner.medium or readers.even[c, r]
+
+
+@inlined
+def _pick_runs(readers, r, end, ways, n, c, manner, picked, runs):
+    """Of the runs from r on, in which some read, the next that have one form each, a block of them at most.
+
+    Their first readers go to `picked`, and their numbers to `runs`. Returns how many, and the run behind them.
+    """
+    many = 0
+    while r < end and many < BLOCK:
+        first, last = readers.first[r], readers.first[r + 1]
+        if _even(readers, r, c, manner) and not faces_away(readers, first, ways, n):
+            if _any_marked(readers.bits, n, first, last):
+                picked[many], runs[many] = first, r
+                many += 1
         r += 1
-    return r
+    return many, r
+
+
+@inlined
+def _pick_others(readers, k, n, c, manner, picked):
+    """Those of a plane that read and have a form of their own; how many."""
+    many = 0
+    for r in range(readers.runs[k], readers.alone[k]):
+        if not _even(readers, r, c, manner):
+            many += pick_marked(readers.bits, n, readers.first[r], readers.first[r + 1], picked[many:])
+    first, last = readers.first[readers.alone[k]], readers.first[readers.runs[k + 1]]
+    return many + pick_marked(readers.bits, n, first, last, picked[many:])
 
 
 @compiled
@@ -323,49 +343,36 @@ def _read_block(readers, c, k, picked, count, rows, way, margin, light, manner, 
 
 
 @inlined
-def _next_part(readers, r, end, ways, n, c, manner, picked):
-    """Of the runs from r on the next whose elements share a form, or all up to there, which have one each.
-
-    Returns the run behind them, how many forms there are, of which readers those are `picked`, and which kind it is.
-    """
-    first = readers.first[r]
-    if shared(readers, r, c, manner):
-        picked[0] = first
-        return r + 1, 0 if faces_away(readers, first, ways, n) else 1, True
-    r = next_block(readers, r, end, c, manner)
-    return r, pick_marked(readers.bits, n, first, readers.first[r], picked), False
-
-
-@inlined
-def _read_run(bits, cell, n, c, k, first, last, count, rows, way, margin, light, manner, form, sums):
-    """Of elements that share a form."""
+def _read_run(bits, cell, n, c, k, first, last, count, rows, way, margin, light, manner, form, i, sums):
+    """Of elements that share the form of number i."""
     where = sums[c], bits, n, cell, first, last
     seen0 = rows[way.row[0], margin - way.move[0] :]
     seen1 = rows[way.row[1], margin - way.move[1] :] if count > 1 else seen0
     seen2 = rows[way.row[2], margin - way.move[2] :] if count > 2 else seen0
-    of_rays = form[0], form[BLOCK], form[2 * BLOCK]
-    add_terms(*where, *of_rays, form[3 * BLOCK], seen0, seen1, seen2, light.source[k, c])
+    of_rays = form[i], form[BLOCK + i], form[2 * BLOCK + i]
+    add_terms(*where, *of_rays, form[3 * BLOCK + i], seen0, seen1, seen2, light.source[k, c])
     if manner.sloped:
         slope0, slope1, slope2 = light.slopes[0][k, c], light.slopes[1][k, c], light.slopes[2][k, c]
-        add_terms(*where, form[4 * BLOCK], form[5 * BLOCK], form[6 * BLOCK], 0.0, slope0, slope1, slope2, slope2)
+        of_slopes = form[4 * BLOCK + i], form[5 * BLOCK + i], form[6 * BLOCK + i]
+        add_terms(*where, *of_slopes, 0.0, slope0, slope1, slope2, slope2)
 
 
 @inlined
 def read(paths, readers, ways, n, k, c, count, way, length, margin, light, spacing, manner, work, sums):
     """Add what elements read of one direction in a plane, as the mean of free `paths` or else of hits."""
-    rows, form, r, end = work.rows, work.form, readers.runs[k], readers.runs[k + 1]
+    rows, form, runs, r, end = work.rows, work.form, work.at, readers.runs[k], readers.alone[k]
     while r < end:
-        first, begins = readers.first[r], r
-        r, many, alike = _next_part(readers, r, end, ways, n, c, manner, work.picked)
-        depth = readers.depth[c, begins] if alike else -1.0
-        for begun in range(0, many, BLOCK):
-            picked = work.picked[begun : min(begun + BLOCK, many)]
-            forms_of(paths, readers, ways, n, c, picked, depth, count, way, length, spacing, manner, form)
-            if alike:
-                last = readers.first[r]
-                _read_run(readers.bits, readers.cell, n, c, k, first, last, count, rows, way, margin, light, manner, form, sums)
-            else:
-                _read_block(readers, c, k, picked, count, rows, way, margin, light, manner, form, work.at, sums)
+        many, r = _pick_runs(readers, r, end, ways, n, c, manner, work.picked, runs)
+        if many:
+            forms_of(paths, readers, ways, n, c, work.picked[:many], count, way, length, spacing, manner, form)
+        for i in range(many):
+            first, last = readers.first[runs[i]], readers.first[runs[i] + 1]
+            _read_run(readers.bits, readers.cell, n, c, k, first, last, count, rows, way, margin, light, manner, form, i, sums)
+    many = _pick_others(readers, k, n, c, manner, work.picked)
+    for begun in range(0, many, BLOCK):
+        picked = work.picked[begun : min(begun + BLOCK, many)]
+        forms_of(paths, readers, ways, n, c, picked, count, way, length, spacing, manner, form)
+        _read_block(readers, c, k, picked, count, rows, way, margin, light, manner, form, work.at, sums)
 
 
 @compiled
@@ -399,16 +406,16 @@ def _ask_medium(readers, c, k, picked, back, here, cut_begun, manner, form, want
 
 
 @inlined
-def _ask_run(bits, cell, n, c, k, first, last, count, asked, back, manner, form, wanted):
+def _ask_run(bits, cell, n, c, k, first, last, count, asked, back, manner, form, i, wanted):
     where, of_band = (bits, n, cell, first, last), wanted[c]
     for number in range(count):
-        if form[number * BLOCK] != 0:
-            _ask_term(asked[number], *where, form[number * BLOCK], of_band)
+        if form[number * BLOCK + i] != 0:
+            _ask_term(asked[number], *where, form[number * BLOCK + i], of_band)
     if manner.medium:
-        _ask_term(back.source[k, c], *where, form[3 * BLOCK], of_band)
+        _ask_term(back.source[k, c], *where, form[3 * BLOCK + i], of_band)
     if manner.sloped:
         for d in range(3):
-            _ask_term(back.slopes[d][k, c], *where, form[(4 + d) * BLOCK], of_band)
+            _ask_term(back.slopes[d][k, c], *where, form[(4 + d) * BLOCK + i], of_band)
 
 
 @inlined
@@ -429,16 +436,16 @@ def _ask_block(readers, c, k, picked, count, asked, back, cut_begun, manner, wor
 @inlined
 def ask(paths, readers, ways, n, k, c, count, way, length, back, cut_begun, spacing, manner, work, wanted):
     """The transpose of `read`: what elements ask of the rays before each segment, and of what is sent."""
-    asked, form, r, end = work.asked, work.form, readers.runs[k], readers.runs[k + 1]
+    asked, form, runs, r, end = work.asked, work.form, work.at, readers.runs[k], readers.alone[k]
     while r < end:
-        first, begins = readers.first[r], r
-        r, many, alike = _next_part(readers, r, end, ways, n, c, manner, work.picked)
-        depth = readers.depth[c, begins] if alike and manner.medium else -1.0
-        for begun in range(0, many, BLOCK):
-            picked = work.picked[begun : min(begun + BLOCK, many)]
-            forms_of(paths, readers, ways, n, c, picked, depth, count, way, length, spacing, manner, form)
-            if alike:
-                last = readers.first[r]
-                _ask_run(readers.bits, readers.cell, n, c, k, first, last, count, asked, back, manner, form, wanted)
-            else:
-                _ask_block(readers, c, k, picked, count, asked, back, cut_begun, manner, work, wanted)
+        many, r = _pick_runs(readers, r, end, ways, n, c, manner, work.picked, runs)
+        if many:
+            forms_of(paths, readers, ways, n, c, work.picked[:many], count, way, length, spacing, manner, form)
+        for i in range(many):
+            first, last = readers.first[runs[i]], readers.first[runs[i] + 1]
+            _ask_run(readers.bits, readers.cell, n, c, k, first, last, count, asked, back, manner, form, i, wanted)
+    many = _pick_others(readers, k, n, c, manner, work.picked)
+    for begun in range(0, many, BLOCK):
+        picked = work.picked[begun : min(begun + BLOCK, many)]
+        forms_of(paths, readers, ways, n, c, picked, count, way, length, spacing, manner, form)
+        _ask_block(readers, c, k, picked, count, asked, back, cut_begun, manner, work, wanted)

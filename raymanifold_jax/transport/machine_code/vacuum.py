@@ -90,7 +90,7 @@ def _read(paths, readers, picked, ways, n, count, way, seen, emitted, manner, fo
     for first in range(0, len(picked), BLOCK):
         last = min(first + BLOCK, len(picked))
         readers_here, size = picked[first:last], last - first
-        forms_of(paths, readers, ways, n, 0, readers_here, 0.0, count, way, 0.0, 0.0, manner, form)
+        forms_of(paths, readers, ways, n, 0, readers_here, count, way, 0.0, 0.0, manner, form)
         total = form[ROWS * BLOCK : ROWS * BLOCK + size]
         for i in range(size):
             total[i] = 0.0
@@ -164,7 +164,7 @@ def _note_links(paths, readers, picked, ways, n, count, way, numbers, sent, mann
     """Add what elements of a plane see in one direction to the list of `links`, and return how long it is."""
     for first in range(0, len(picked), BLOCK):
         last = min(first + BLOCK, len(picked))
-        forms_of(paths, readers, ways, n, 0, picked[first:last], 0.0, count, way, 0.0, 0.0, manner, form)
+        forms_of(paths, readers, ways, n, 0, picked[first:last], count, way, 0.0, 0.0, manner, form)
         for number in range(4 if paths else 3):
             if 3 > number >= count:
                 continue

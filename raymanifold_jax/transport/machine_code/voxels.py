@@ -260,16 +260,22 @@ def through_free(planes, k, c, number, many, light, manner, work, sums):
 @inlined
 def light_of_ghosts(ghosts, k, c, n, ways, light, sent):
     """What the ghost voxels of a plane send in a direction: their surfaces' light, and what comes in through open sides."""
-    begun = ghosts.first[k]
-    for i in range(ghosts.first[k + 1] - begun):
-        sent[i] = light.ghost[c, begun + i]
-        image = ghosts.image[begun + i]
-        if light.radiance.shape[0] and image >= 0:
-            sent[i] += light.radiance[image, ways.index[n], c] * light.factor[c, begun + i]
+    first, last = ghosts.first[k], ghosts.first[k + 1]
+    own, image, factor = light.ghost[c, first:last], ghosts.image[first:last], light.factor[c, first:last]
+    for i in range(len(own)):
+        sent[i] = own[i]
+    if light.radiance.shape[0]:
+        for i in range(len(own)):
+            if image[i] >= 0:
+                sent[i] += light.radiance[image[i], ways.index[n], c] * factor[i]
 
 
 @inlined
 def from_ghosts(ghosts, k, gone, sent):
     cell = ghosts.cell[ghosts.first[k] : ghosts.first[k + 1]]
+    if len(cell) == len(gone):  # all of the plane, in order
+        for i in range(len(gone)):
+            gone[i] = sent[i]
+        return
     for i in range(len(cell)):
         gone[cell[i]] = sent[i]
