@@ -87,7 +87,7 @@ class _Medium(NamedTuple):
     depth: np.ndarray
     extinction: np.ndarray
     cut: np.ndarray
-    readers: tuple[tuple[np.ndarray, np.ndarray, np.ndarray], ...]  # even, depth, extinction of the hits' and the probes'
+    readers: tuple[tuple[np.ndarray, np.ndarray], ...]  # of the hits' and the probes' runs, whether it is even; and of each
 
 
 def sweep(
@@ -244,11 +244,11 @@ def views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray)
             for first in range(0, len(part), how.rows):
                 batch = part[first : first + how.rows]
                 # A hit sees by three segments at most, a probe its own surface as well.
-                most = sum(kinds * int(np.unpackbits(r.bits[batch]).sum()) for kinds, r in ((3, hits), (4, probes)))
+                most = sum(kinds * int(np.bitwise_count(r.bits[batch]).sum()) for kinds, r in ((3, hits), (4, probes)))
                 lists = np.empty(most, np.int32), np.empty(most, np.int32), np.empty(most, real)
                 known = batch, line.ways, planes, cut, line.ghosts, hits, probes, how, work
                 count = code.views(*known, *listed, *lists)
-                seen.append(tuple(values[:count].copy() for values in lists))
+                seen.append(tuple(values[:count] for values in lists))  # what lies behind was never written: no memory
             return seen
 
         return list(on_cores(run, line.parts))
@@ -342,7 +342,10 @@ def hit_bits(
     i, j, k = (int(stride) for stride in strides)
     around = code.Around(*shape, padded, (i, j, k), np.array([np.asarray(g) for g in geometry]))
     first = np.searchsorted(plane[order], np.arange(shape[0] + 1))
-    elements = code.Elements(first, np.asarray(face)[:, order], row[order].astype(int), column[order].astype(int))
+    face = np.asarray(face)[:, order]
+    alike = np.append(False, np.all(face[:, 1:] == face[:, :-1], axis=0))[: len(order)]
+    alike[first[:-1][first[:-1] < len(order)]] = False  # each plane begins anew
+    elements = code.Elements(first, face, alike, row[order].astype(int), column[order].astype(int))
     known = _contiguous((_ways(code, ordinates, chunk, place), around, elements, chunk, place))
     found = np.zeros((ordinates.weight.shape[0], -(-ordinates.weight.shape[1] // 32), len(order)), np.uint32)
     # Directions of a chunk share words: each chunk is one core's.
@@ -441,8 +444,7 @@ def _arguments(code, layout: Layout, line: _Axis, medium: _Medium, axis: int, re
     margin, spacing = _margin(line, real), float(layout.spacing)
     planes = code.Planes(height, width, margin, wrap_v, spacing, medium.even, medium.depth, medium.extinction)
     readers = (
-        r._replace(even=even, depth=depth, extinction=each)
-        for r, (even, depth, each) in zip((line.hits, line.probes), medium.readers, strict=True)
+        r._replace(even=even, extinction=each) for r, (even, each) in zip((line.hits, line.probes), medium.readers, strict=True)
     )
     return planes, line.cut._replace(extinction=medium.cut), *readers
 
@@ -599,15 +601,13 @@ def _readers(
     where = plane * surface.shape[1] + cell
     cut = np.where(surface.ravel()[where], number[where], -1)
     face = np.array([np.asarray(values)[used] for values in (*reads.plane, reads.height)])
-    keys = np.array([*face, cut, plane])
-    order = np.lexsort(keys)
-    begins = _runs(keys[:, order], cut[order])
+    order = np.lexsort((_mixed(face), cut, plane))
+    sizes = np.diff(_runs(face[:, order], cut[order], plane[order]), append=len(order))
     # Those that are runs of their own come after all others of their plane.
-    alone = np.repeat(sizes := np.diff(begins, append=len(order)), sizes) == 1
-    order = order[np.lexsort((alone, plane[order]))]
-    keys, cut = keys[:, order], cut[order]
-    begins = _runs(keys, cut)
-    several, of_runs = np.diff(begins, append=len(order)) > 1, plane[order][begins]
+    order = order[np.argsort(2 * plane[order] + np.repeat(sizes == 1, sizes), kind="stable")]
+    face, cut, plane = face[:, order], cut[order], plane[order]
+    begins = _runs(face, cut, plane)
+    several, of_runs = np.diff(begins, append=len(order)) > 1, plane[begins]
     count = len(reads.first_tile) - 1
     planes = np.zeros((4, len(order)), face.dtype)
     planes[0] = 1.0
@@ -617,23 +617,28 @@ def _readers(
         runs=runs,
         alone=runs[:-1] + np.bincount(of_runs[several], minlength=count),
         first=np.append(begins, len(order)),
-        face=face[:4, order],
+        face=face[:4],
         plane=planes,
-        height=face[4, order],
+        height=face[4],
         cut=cut,
         cell=_to_bytes(cell[order].astype(np.uint32)),
         element=_to_bytes(np.asarray(reads.element)[used][order].astype(int)),
-        bits=_packed_marks(code, marked, used[order], face[:4, order]),
+        bits=_packed_marks(code, marked, used[order], face[:4]),
         even=np.zeros((1, 0), bool),
-        depth=np.zeros((1, 0)),
         extinction=np.zeros((1, 0)),
     )
 
 
-def _runs(keys: np.ndarray, cut: np.ndarray) -> np.ndarray:
-    """Where runs of readers with the same keys begin."""
-    changes = np.any(keys[:, 1:] != keys[:, :-1], axis=0) | (cut[1:] >= 0)
-    return np.nonzero(np.concatenate([[keys.shape[1] > 0], changes]))[0]
+def _mixed(face: np.ndarray) -> np.ndarray:
+    """A number for each column, by which to bring those together that are alike."""
+    bits = (face + 0.0).view(f"u{face.itemsize}").astype(np.uint64)  # one zero, not two
+    return np.dot(np.uint64(0x9E3779B97F4A7C15) ** np.arange(1, len(face) + 1, dtype=np.uint64), bits)
+
+
+def _runs(face: np.ndarray, cut: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """Where runs of readers with the same face and plane begin; those in CUT voxels are runs of their own."""
+    changes = np.any(face[:, 1:] != face[:, :-1], axis=0) | (cut[1:] >= 0) | (plane[1:] != plane[:-1])
+    return np.nonzero(np.concatenate([[len(plane) > 0], changes]))[0]
 
 
 def _to_bytes(of_readers: np.ndarray) -> np.ndarray:
@@ -645,8 +650,9 @@ def _packed_marks(code, marked: tuple, image: np.ndarray, face: np.ndarray) -> n
     """Who reads in each direction, as bits [N, M / 8], of the readers that are `image` in the layout."""
     ways, chunk, place, words, wanted = marked
     bits = np.zeros((len(chunk), -(-len(image) // 8)), np.uint8)
-    known = _contiguous((ways, words, np.uint32(wanted), chunk, place, image.astype(np.int32), face))
-    code.pack(np.arange(len(chunk)), *known, bits)
+    known = _contiguous((ways, words, np.uint32(wanted), chunk, place, image.astype(np.uint32), face))
+    room = np.empty(len(image), np.uint32), np.zeros(8 * bits.shape[1], np.uint8)
+    code.pack(np.arange(len(chunk)), *known, *room, bits)
     return bits
 
 
@@ -671,7 +677,7 @@ def _medium(layout: Layout, line: _Axis, axis: int, extinction, bands: int, real
     if extinction is None:
         count = line.shape[0]
         nothing = np.zeros((bands, 0), real)
-        reader = np.zeros((bands, 0), bool), np.zeros((bands, 0)), np.zeros((bands, 0))
+        reader = np.zeros((bands, 0), bool), np.zeros((bands, 0))
         free = np.full((count, bands), code.EVEN), np.zeros((count, bands))
         return _Medium(False, *free, np.zeros((1, 1, 1), real), nothing, (reader, reader))
     name = "medium", axis, id(line.hits.bits)
@@ -694,7 +700,7 @@ def _make_medium(line: _Axis, axis: int, extinction: Float[Array, "C X Y Z"], re
     def of_readers(r: machine_code.Readers):
         each = planes[number(r.runs)[number(r.first)], :, r.cell[: r.first[-1]]].T.astype(float)
         least, most = (f.reduceat(each, r.first[:-1], axis=1) if r.first[-1] else each for f in (np.minimum, np.maximum))
-        return least == most, most, np.ascontiguousarray(each)
+        return least == most, np.ascontiguousarray(each)
 
     cut = planes[number(line.cut.first), :, line.cut.cell].T
     return _Medium(

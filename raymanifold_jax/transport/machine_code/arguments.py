@@ -62,8 +62,7 @@ class Readers(NamedTuple):
     cell: Any  # [M] unsigned
     element: Any  # [M]
     bits: Any  # [N, M / 8] whether it reads in a direction, which comes from before it
-    even: Any  # [C, R] whether all of the run have the extinction `depth`
-    depth: Any  # [C, R]
+    even: Any  # [C, R] whether all of the run have the same extinction
     extinction: Any  # [C, M] of the voxel
 
 
@@ -83,6 +82,7 @@ class Elements(NamedTuple):
 
     first: Any  # [K + 1]
     face: Any  # [4, I]
+    alike: Any  # [I] whether its face is that of the one before it
     row: Any  # [I]
     column: Any  # [I]
 

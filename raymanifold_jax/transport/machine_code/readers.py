@@ -215,7 +215,7 @@ def _paths(form, size, to, b, s, share, length, spacing, limit, onward, sloped):
 
 @inlined
 def forms_of(paths, readers, ways, n, c, picked, count, way, length, spacing, manner, form):
-    """The forms of the `picked` readers, times cosine and weight of the direction: as the mean of free `paths` or else of hits."""
+    """The forms of the `picked` readers, times cosine and weight of the direction: the mean of free `paths` or else of hits."""
     size = len(picked)
     _load(paths, readers, ways, n, picked, manner, form)
     if manner.medium:
@@ -261,10 +261,10 @@ def _finish(form, size, manner):
 
 @compiled
 def _any_marked(bits, n, first, last):
+    marks = np.uintp(0)
     for byte in range(first >> 3, (last + 7) >> 3):
-        if _marks_within(bits, n, byte, first, last) != 0:
-            return True
-    return False
+        marks |= _marks_within(bits, n, byte, first, last)
+    return marks != 0
 
 
 @register_jitable
@@ -282,10 +282,10 @@ def _pick_runs(readers, r, end, ways, n, c, manner, picked, runs):
     many = 0
     while r < end and many < BLOCK:
         first, last = readers.first[r], readers.first[r + 1]
-        if _even(readers, r, c, manner) and not faces_away(readers, first, ways, n):
-            if _any_marked(readers.bits, n, first, last):
-                picked[many], runs[many] = first, r
-                many += 1
+        lit = _even(readers, r, c, manner) and not faces_away(readers, first, ways, n)
+        if lit and _any_marked(readers.bits, n, first, last):
+            picked[many], runs[many] = first, r
+            many += 1
         r += 1
     return many, r
 

@@ -7,6 +7,7 @@ multiplication a voxel and segment.
 
 from __future__ import annotations
 
+import numpy as np
 from numba.extending import register_jitable
 
 from .arguments import BLOCK, ROWS
@@ -48,12 +49,14 @@ def _picked(reading, hits, probes, n, k, picked):
     return picked[0, :many], picked[1, :more]
 
 
-@inlined
-def _note_rays(readers, picked, row, shift, seen):
+# Loops of their own, which take few arrays: in a long function their addresses would be fetched anew in every turn.
+
+
+@compiled
+def _take_rays(cell, picked, row, shift, seen):
     """Keep the rays of one segment that readers ask for: they may be other ones after it."""
-    size = len(row)
     for i in range(len(picked)):
-        seen[i] = row[place(readers.cell[picked[i]], shift, size)]
+        seen[i] = row[place(cell[picked[i]], shift, len(row))]
 
 
 @compiled
@@ -63,11 +66,18 @@ def _add_to(sums, row, weight):
         sums[i] += w * row[i]
 
 
-@inlined
-def _from_ghosts(ghosts, k, row, shift, sent):
-    begun = ghosts.first[k]
-    for i in range(ghosts.first[k + 1] - begun):
-        row[place(ghosts.cell[begun + i], shift, len(row))] = sent[i]
+@compiled
+def _put_rays(cell, row, shift, sent):
+    """Let rays begin in listed voxels."""
+    size = len(row)
+    if len(cell) == size:  # all of the plane, in order
+        for i in range(shift):
+            row[np.uintp(size - shift + i)] = sent[i]
+        for i in range(size - shift):
+            row[i] = sent[np.uintp(shift + i)]
+        return
+    for i in range(len(cell)):
+        row[place(cell[i], shift, size)] = sent[i]
 
 
 @compiled
@@ -132,14 +142,14 @@ def in_vacuum(chosen, ways, planes, cut, ghosts, hits, probes, light, manner, wo
                         for number in range(segments):
                             shift[b] = _carry(row, shift[b], way.move[number], planes)
                             if reading:
-                                _note_rays(hits, of_hits, row, shift[b], work.hits[number])
-                                _note_rays(probes, of_probes, row, shift[b], work.probes[number])
+                                _take_rays(hits.cell, of_hits, row, shift[b], work.hits[number])
+                                _take_rays(probes.cell, of_probes, row, shift[b], work.probes[number])
                             if summing:
                                 ahead, weight = shift[b], ways.weight[n] * way.share[number]
                                 _add_to(sums[:ahead], row[size - ahead :], weight)
                                 _add_to(sums[ahead:size], row[: size - ahead], weight)
                             through_cut_in_vacuum(cut, k, number, way, row, shift[b], here, ways.weight[n])
-                            _from_ghosts(ghosts, k, row, shift[b], work.sent)
+                            _put_rays(ghosts.cell[ghosts.first[k] : ghosts.first[k + 1]], row, shift[b], work.sent)
                         if reading:
                             there = emitted, manner, form, work.at
                             _read(False, hits, of_hits, ways, n, segments, way, work.hits, *there, at_hits[c])
@@ -159,26 +169,33 @@ def _number_cut(cells, k, number, way, row, shift, sent):
             row[place(cells.cell[j], shift, size)] = sent[j]
 
 
+@compiled
+def _append(picked, codes, shares, of_readers, element, source, weight):
+    """Write links to the lists; how many. All are written: a processor cannot guess which count."""
+    links = np.uintp(0)
+    for i in range(len(picked)):
+        code, share = codes[i], shares[i]
+        element[links], source[links], weight[links] = of_readers[picked[i]], code, share
+        links += np.uintp((code > 0) & (share != 0))
+    return np.int64(links)
+
+
 @inlined
-def _note_links(paths, readers, picked, ways, n, count, way, numbers, sent, manner, form, links, element, source, weight):
+def _note_links(paths, readers, picked, ways, n, count, way, numbers, sent, manner, form, at, links, element, source, weight):
     """Add what elements of a plane see in one direction to the list of `links`, and return how long it is."""
     for first in range(0, len(picked), BLOCK):
         last = min(first + BLOCK, len(picked))
-        forms_of(paths, readers, ways, n, 0, picked[first:last], count, way, 0.0, 0.0, manner, form)
-        for number in range(4 if paths else 3):
-            if 3 > number >= count:
-                continue
-            shares = form[(7 if number == 3 else number) * BLOCK :]
+        here, known = picked[first:last], readers.element
+        forms_of(paths, readers, ways, n, 0, here, count, way, 0.0, 0.0, manner, form)
+        for number in range(count):
+            lists = element[links:], source[links:], weight[links:]
+            links += _append(here, numbers[number, first:last], form[number * BLOCK :], known, *lists)
+        if paths and len(sent):
+            lists = element[links:], source[links:], weight[links:]
+            take_cut_numbers(at, readers.cut, here)
             for i in range(last - first):
-                m, share = picked[first + i], shares[i]
-                code = 0
-                if number < 3:
-                    code = numbers[number, first + i]
-                elif share != 0:
-                    code = sent[readers.cut[m]]
-                # Written in any case: a processor cannot guess which count.
-                element[links], source[links], weight[links] = readers.element[m], code, share
-                links += 1 if (code > 0) & (share != 0) else 0
+                at[i] = sent[at[i]]
+            links += _append(here, at, form[7 * BLOCK :], known, *lists)
     return links
 
 
@@ -188,7 +205,7 @@ def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut,
     Written one by one in the `chosen` directions: element, number and weight; returns how many there are. `of_cut` and
     `of_ghosts` are the numbers of listed voxels, 0 for those that send nothing.
     """
-    count, size = planes.even.shape[0], planes.height * planes.width
+    count = planes.even.shape[0]
     rows, shift, way, form = work.rows, work.shift, work.way, work.form
     most, links = len(rows), 0
     for first in range(0, len(chosen), most):
@@ -206,13 +223,13 @@ def views(chosen, ways, planes, cut, ghosts, hits, probes, manner, work, of_cut,
                     for number in range(segments):
                         shift[b] = _carry(row, shift[b], way.move[number], planes)
                         if when >= 0:
-                            _note_rays(hits, read_hits, row, shift[b], work.hits[number])
-                            _note_rays(probes, read_probes, row, shift[b], work.probes[number])
+                            _take_rays(hits.cell, read_hits, row, shift[b], work.hits[number])
+                            _take_rays(probes.cell, read_probes, row, shift[b], work.probes[number])
                         _number_cut(cut, k, number, way, row, shift[b], of_cut)
-                        for j in range(ghosts.first[k], ghosts.first[k + 1]):
-                            row[place(ghosts.cell[j], shift[b], size)] = of_ghosts[j]
+                        begun, end = ghosts.first[k], ghosts.first[k + 1]
+                        _put_rays(ghosts.cell[begun:end], row, shift[b], of_ghosts[begun:end])
                     if when >= 0:
-                        there = of_cut, manner, form
+                        there = of_cut, manner, form, work.at
                         known = ways, n, segments, way
                         links = _note_links(False, hits, read_hits, *known, work.hits, *there, links, element, source, weight)
                         links = _note_links(
