@@ -10,7 +10,7 @@ The functions take arrays in scene units, compute in JAX's default float type, a
 made to be differentiated: what is in front of what has no gradient here.
 
 Public: `Hit`, `first_hit`, `visible`; for blocks of rays `trace_rays`, `visible_unfolded`,
-`share_that_passes`, `patch_visible`; and `march`, `transmittance` from `march`.
+`share_that_passes`, `look_at_patch`, `go_on_looking`; and `march`, `transmittance` from `march`.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ from .unfolding import Axis, box_span, fold, in_blocks, sloped, to_scene, to_vox
 
 _PASSES = 64  # images of the lattice that a ray crosses at most
 _STEPS = 1024  # of sphere tracing
+_ROUND = 48  # steps after which lines of sight are sorted by how long they will take
+#: Rounds after which one that goes on counts as free.
+ROUNDS = _STEPS // _ROUND
 _TOUCH = 1e-4  # voxels: nearer is a hit
 _NEAR = 0.02  # voxels: a ray that ends undecided this near is a hit too
 _CRAWL = 1e-3  # voxels: the least step
@@ -186,7 +189,9 @@ def _visible(scene: Scene, start: Array, end: Array) -> Array:
 
 def visible_unfolded(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"]) -> Float[Array, " n"]:
     """`visible` for one block, between points in unfolded voxel coordinates."""
-    return _line_of_sight(scene, o, e, None)[0]
+    if not scene.solids:
+        return jnp.ones(o.shape[:1], o.dtype)
+    return jnp.where(_look(scene, o, e, None, _nothing_seen(o), _STEPS).blocked, 0.0, 1.0).astype(o.dtype)
 
 
 def share_that_passes(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"]) -> Float[Array, "n C"]:
@@ -194,16 +199,37 @@ def share_that_passes(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3
     return transmittance_unfolded(scene, o, e) * visible_unfolded(scene, o, e)[:, None]
 
 
-def patch_visible(
-    scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"], radius: Float[Array, " n"]
-) -> tuple[Float[Array, " n"], Bool[Array, " n"]]:
-    """The same, and whether it holds for all of the patch of that radius around `e`, by how near solids come on the way."""
-    return _line_of_sight(scene, o, e, radius)
+class Sight(NamedTuple):
+    """Lines of sight under way, (n,) each: how far they are, in voxels, and what they met."""
+
+    t: Float[Array, " n"]
+    blocked: Bool[Array, " n"]
+    free: Bool[Array, " n"]  # once away from rough surfaces
+    least: Float[Array, " n"]  # of the distances to solids, less the radius of the cone to a patch
+    most: Float[Array, " n"]  # of the depths in solids, less that
+    effort: Float[Array, " n"]  # about how many steps are left; 0 where it is over
 
 
-def _line_of_sight(scene: Scene, o: Array, e: Array, radius: Array | None) -> tuple[Array, Array]:
-    if not scene.solids:
-        return jnp.ones(o.shape[:1], o.dtype), jnp.ones(o.shape[:1], bool)
+def look_at_patch(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"], radius: Float[Array, " n"]) -> Sight:
+    """The first steps from `o` to patches of a `radius` around `e`, in unfolded voxel coordinates; for one block."""
+    return _look(scene, o, e, radius, _nothing_seen(o), _ROUND)
+
+
+def go_on_looking(
+    scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"], radius: Float[Array, " n"], *sight: Array
+) -> Sight:
+    """The rest of the way. A block takes as long as its longest: best are those together that have as much before them."""
+    t, blocked, free, least, most, effort = sight
+    return _look(scene, o, e, radius, Sight(t, blocked > 0, free > 0, least, most, effort), _ROUND)
+
+
+def _nothing_seen(o: Array) -> Sight:
+    zero, none = jnp.zeros(o.shape[:1], o.dtype), jnp.zeros(o.shape[:1], bool)
+    return Sight(zero, none, none, zero + jnp.inf, zero - jnp.inf, zero)
+
+
+def _look(scene: Scene, o: Array, e: Array, radius: Array | None, sight: Sight, steps: int) -> Sight:
+    """So many steps more, at most, along lines of sight that are not over."""
     axes = unfolded_axes(scene)
     folds = any(axis.kind != "plain" for axis in axes)
     distance = lambda u: _distance(scene, fold(axes, u)[0] if folds else u)
@@ -215,10 +241,14 @@ def _line_of_sight(scene: Scene, o: Array, e: Array, radius: Array | None) -> tu
     deepest = jnp.clip(ends, -10 * _BEHIND, 0.0) - _CRAWL
     bumps = _bumps(scene, o.dtype)
 
+    def goes_on(sight: Sight):
+        done = sight.blocked if radius is None else sight.blocked & (sight.most > 0)
+        return ~done & (sight.t < stop)
+
     def step(state):
-        t, blocked, free, (least, most), count = state
+        (t, blocked, free, least, most, _), _, count = state
         near = distance(o + t[:, None] * w)
-        going = goes_on(state)
+        going = goes_on(state[0])
         blocks = near < (deepest if bumps is None else jnp.where(free, deepest, deepest - bumps))
         free = free if bumps is None else free | (near > bumps)
         if radius is not None:
@@ -227,16 +257,10 @@ def _line_of_sight(scene: Scene, o: Array, e: Array, radius: Array | None) -> tu
             counts = going & (t < length - 2 * radius)
             least = jnp.where(counts, jnp.minimum(least, near - cone), least)
             most = jnp.where(counts, jnp.maximum(most, -near - cone), most)
-        t = jnp.where(going, t + jnp.maximum(jnp.abs(near), _BEHIND), t)
-        return t, blocked | (going & blocks), free, (least, most), count + 1
+        ahead = jnp.maximum(jnp.abs(near), _BEHIND)
+        t = jnp.where(going, t + ahead, t)
+        return Sight(t, blocked | (going & blocks), free, least, most, sight.effort), ahead, count + 1
 
-    def goes_on(state):
-        t, blocked, _, (_, most), _ = state
-        done = blocked if radius is None else blocked & (most > 0)
-        return ~done & (t < stop)
-
-    none = jnp.zeros(stop.shape, bool)
-    start = (jnp.zeros_like(stop), none, none, (jnp.full_like(stop, jnp.inf), jnp.full_like(stop, -jnp.inf)), 0)
-    state = lax.while_loop(lambda s: goes_on(s).any() & (s[4] < _STEPS), step, start)
-    _, blocked, _, (least, most), _ = state
-    return jnp.where(blocked, 0.0, 1.0).astype(o.dtype), jnp.where(blocked, most > 0, least > 0)
+    begun = (sight, jnp.ones_like(stop), 0)
+    found, ahead, _ = lax.while_loop(lambda s: goes_on(s[0]).any() & (s[2] < steps), step, begun)
+    return found._replace(effort=jnp.where(goes_on(found), (stop - found.t) / ahead, 0.0))

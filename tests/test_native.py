@@ -60,6 +60,11 @@ _SCENES = {
     "thick uneven fog in two bands": lambda: _box(rm.Medium(_uneven((9, 9, 9, 2), 12.0), absorption=0.3), _ROOM),
     "around an axis, mirrored": lambda: _box(rm.Medium(_uneven((5, 6, 9), 4.0), absorption=0.3), _AROUND, (5, 6, 9)),
     "around two axes": lambda: _box(rm.Medium(2.0, absorption=0.5), _TORUS, (9, 5, 4)),
+    # More runs of elements with the same face in a plane than are worked on at a time.
+    "a gentle slope": lambda: rm.Scene(
+        rm.Lattice((400, 4, 6), 0.5), solids=[rm.Solid(rm.HalfSpace((0, 0, 1.2), (-0.0045, 0, 1)), 0.7)],
+        medium=rm.Medium(0.3, 0.1), lights=[rm.Sky(1.0)], boundary=_ROOM,
+    ),
     "one column": lambda: rm.Scene(
         rm.Lattice((1, 1, 6), 0.5), medium=rm.Medium(1.0, 0.2), lights=[rm.Sky(1.0)],
         boundary=rm.Boundary(x=rm.PERIODIC, y=rm.PERIODIC, z=(rm.Wall(0.3), rm.OPEN)),
