@@ -81,4 +81,5 @@ def worked_out_now() -> AbstractContextManager:
 
 def stop_gradient(tree: T) -> T:
     """The same numbers without derivatives: known ones, unless `jit` or `vmap` traces them."""
-    return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_inexact_array(a) else a, tree)
+    # What is known stays as it is: while JAX stages, it would become part of the program.
+    return jax.tree.map(lambda a: lax.stop_gradient(a) if eqx.is_inexact_array(a) and checks.is_traced(a) else a, tree)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -220,8 +221,9 @@ def _arriving(
     scene: Scene, patches: _Patches, surfaces: Surfaces, rows: np.ndarray, radiance: Float[Array, "C owners"]
 ) -> tuple[Float[Array, "C n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """The mean irradiance of some elements; what it would be without a medium, of radiance 1; which are next to emitters."""
-    still, parts, unattenuated = stop_gradient(scene), [], []
-    receiver, position, weight = _receivers(scene, patches, surfaces, rows)
+    still, parts, unattenuated = _still(scene), [], []
+    with worked_out_now():
+        receiver, position, weight = _receivers(still, patches, surfaces, rows)
     normal = surfaces.normal[rows][receiver]
     for begin in range(0, len(receiver), _BLOCK):
         facing, share = (values[begin : begin + _BLOCK] for values in (normal, weight))
@@ -233,6 +235,12 @@ def _arriving(
     found = jnp.zeros((radiance.shape[0], len(rows)), radiance.dtype).at[:, receiver].add(jnp.concatenate(parts, -1))
     near = np.bincount(receiver, minlength=len(rows)) > 1
     return found, np.bincount(receiver, np.concatenate(unattenuated), len(rows)), near
+
+
+def _still(scene: Scene) -> Scene:
+    """The scene without derivatives, and with 0 for what JAX stages: not its shapes, which are all that sight depends on."""
+    zero = lambda a: np.zeros(a.shape, a.dtype) if checks.is_traced(a) else a
+    return jax.tree.map(zero, stop_gradient(scene))
 
 
 def _receivers(scene: Scene, patches: _Patches, surfaces: Surfaces, rows: np.ndarray) -> tuple[np.ndarray, ...]:
@@ -251,7 +259,7 @@ def _receivers(scene: Scene, patches: _Patches, surfaces: Surfaces, rows: np.nda
     points = points + (surfaces.voxel[rows[near]] + 0.5)[:, None]
     if scene.solids and len(near):  # what another solid covers of a face is none of it
         outside = scene.lattice.lower + (points + 0.02 * normal[:, None]) * scene.lattice.spacing
-        weight = np.where(np.asarray(stop_gradient(scene).distance(jnp.asarray(outside))) > 0, weight, 0.0)
+        weight = np.where(np.asarray(scene.distance(jnp.asarray(outside))) > 0, weight, 0.0)
     alone = ~weight.any(1)
     points[alone, 0], weight[alone, 0] = position[near[alone]], 1.0
     kept = weight > 0

@@ -31,7 +31,7 @@ from .unfolding import Axis, box_span, fold, in_blocks, sloped, to_scene, to_vox
 
 _PASSES = 64  # images of the lattice that a ray crosses at most
 _STEPS = 1024  # of sphere tracing
-_ROUND = 48  # steps after which lines of sight are sorted by how long they will take
+_ROUND = 64  # steps after which lines of sight are sorted by how long they will take; a whole number of rounds
 #: Rounds after which one that goes on counts as free.
 ROUNDS = _STEPS // _ROUND
 _TOUCH = 1e-4  # voxels: nearer is a hit
