@@ -30,7 +30,7 @@ from .march import transmittance_unfolded
 from .programs import program
 from .scene import OPEN, Scene, Wall
 from .surfaces import Surfaces, patch_points
-from .trace import ROUNDS, Sight, go_on_looking, look_at_patch
+from .trace import ROUNDS, go_on_looking, look_at_patch
 from .unfolding import in_blocks, mirror_images, unfolded_axes
 
 _WIDTH = 0.35  # of a patch, at most, for its distance
@@ -288,16 +288,17 @@ def _looked_at(scene: Scene, patches: _Patches, start: np.ndarray, pairs: _Pairs
     end = patches.target[pairs.patch] + CLEARANCE * patches.normal[pairs.patch]
     radius = _RADIUS * patches.size[pairs.patch]
     rays = start[pairs.element], end, radius
-    sight = Sight(*(np.array(values) for values in in_blocks(look_at_patch, scene, rays)))
+    sight = [np.array(values) for values in in_blocks(look_at_patch, scene, rays)]
+    _, blocked, _, least, most, effort = sight
     for _ in range(ROUNDS - 1):
         # Along a surface it takes ten times as many steps as the mean: those that do go on side by side, the longest first.
-        late = np.argsort(-sight.effort)[: np.count_nonzero(sight.effort)]
+        late = np.argsort(-effort)[: np.count_nonzero(effort)]
         if not len(late):
             break
         rest = in_blocks(go_on_looking, scene, tuple(values[late] for values in (*rays, *sight)))
         for values, found in zip(sight, rest, strict=True):
             values[late] = found
-    return ~sight.blocked, np.where(sight.blocked, sight.most > 0, sight.least > 0)
+    return ~blocked, np.where(blocked, most > 0, least > 0)
 
 
 def _narrow(patches: _Patches, start: np.ndarray, facing: np.ndarray) -> _Pairs:

@@ -342,10 +342,10 @@ def hit_bits(
     i, j, k = (int(stride) for stride in strides)
     around = code.Around(*shape, padded, (i, j, k), np.array([np.asarray(g) for g in geometry]))
     first = np.searchsorted(plane[order], np.arange(shape[0] + 1))
-    face = np.asarray(face)[:, order]
-    alike = np.append(False, np.all(face[:, 1:] == face[:, :-1], axis=0))[: len(order)]
+    faces = np.asarray(face)[:, order]
+    alike = np.append(False, np.all(faces[:, 1:] == faces[:, :-1], axis=0))[: len(order)]
     alike[first[:-1][first[:-1] < len(order)]] = False  # each plane begins anew
-    elements = code.Elements(first, face, alike, row[order].astype(int), column[order].astype(int))
+    elements = code.Elements(first, faces, alike, row[order].astype(int), column[order].astype(int))
     known = _contiguous((_ways(code, ordinates, chunk, place), around, elements, chunk, place))
     found = np.zeros((ordinates.weight.shape[0], -(-ordinates.weight.shape[1] // 32), len(order)), np.uint32)
     # Directions of a chunk share words: each chunk is one core's.
