@@ -21,6 +21,8 @@ import os
 from collections.abc import Callable
 from pathlib import Path
 
+from .threads import count_cores
+
 PROGRAM = 430_000_000  # Python, JAX, programs; a first start, which compiles them, takes 0 to 170 MB more
 SWEEPS = 150_000_000  # compilation of XLA's sweeps
 BAND = 50_000_000  # work arrays of a batch
@@ -47,7 +49,7 @@ def estimate_memory(scene_shape: Shape, bands: int, directions: int, medium: boo
     nx, ny, nz = scene_shape
     if elements is None:
         elements = 3 * (nx * ny + ny * nz + nz * nx)
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = count_cores()
     fields = GEOMETRY + bands * ((FIELDS_MEDIUM if medium else FIELDS_VACUUM) + cores)
     links = 0 if medium else LINKS * elements * directions
     links = links // 2 if links <= MOST_LINKS else 0

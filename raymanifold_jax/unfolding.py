@@ -25,13 +25,14 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from . import checks
-from .arrays import real_dtype
+from .arrays import on_accelerator, real_dtype
 from .programs import program
 from .scene import MIRROR, PERIODIC, Scene
-from .transport.cores import count_cores
+from .threads import count_cores, on_threads
 
 _BLOCK = 1 << 14  # rays a call
 _BUNDLE = 1 << 10  # rays that step together: neighbours end at about the same time
+_SIZES = 1 << 7, _BUNDLE, _BLOCK
 
 
 class Axis(NamedTuple):
@@ -137,26 +138,28 @@ def in_blocks(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
     real = real_dtype()
     if checks.is_traced(arrays):
         return _in_bundles(function, scene, tuple(jnp.asarray(a, real) for a in arrays))
-    count = len(arrays[0])
-    # Few sizes, each compiled once: powers of two, then whole blocks.
-    block = min(_BLOCK, max(64, 1 << (max(count, 1) - 1).bit_length()))
+    count, known = len(arrays[0]), not checks.is_traced(scene)
+    # Few sizes, each compiled once. Derivatives cannot leave bundles out.
+    block = min([size for size in _SIZES if size >= count] or [_BLOCK]) if known else _power_of_two(count)
     arrays = tuple(_padded(np.asarray(a, real), block, np) for a in arrays)
-    call = _jitted_again if checks.is_traced(scene) else _jitted
     blocks = [tuple(a[i : i + block] for a in arrays) for i in range(0, len(arrays[0]), block)]
-    run = lambda rays: call(function, scene, rays)
-    if len(blocks) > 2 and not checks.is_traced(scene) and jax.default_backend() == "cpu":
-        # XLA works on what one thread asks for in turn. The first block alone, for the program to be compiled once.
-        here = functools.partial(_as_here, real == np.float64, jax.config.jax_default_device, run)  # pyright: ignore[reportAttributeAccessIssue]
-        parts = [run(blocks[0]), *_pool().map(here, blocks[1:])]
+
+    def run(begin: int, rays: tuple[np.ndarray, ...]) -> Any:
+        if not known:
+            return _jitted_again(function, scene, rays)
+        return _jitted(function, scene, rays, np.array(-(-(count - begin) // _BUNDLE), np.int32))
+
+    begins = range(0, len(arrays[0]), block)
+    if len(blocks) > 2 and known and not on_accelerator():
+        # The first block alone, for the program to be compiled once.
+        parts = [run(0, blocks[0]), *on_threads(_pool(), run, begins[1:], blocks[1:])]
     else:
-        parts = [*map(run, blocks)]
-    return parts[0] if len(arrays[0]) == count == block else _joined(tuple(parts), count)
+        parts = [*map(run, begins, blocks)]
+    return parts[0] if len(arrays[0]) == count == block else _joined(parts, count)
 
 
-def _as_here(x64: bool, device: Any, run: Callable, rays: tuple[np.ndarray, ...]) -> Any:
-    # Contexts hold for one thread only.
-    with jax.enable_x64(x64), jax.default_device(device):
-        return jax.block_until_ready(run(rays))
+def _power_of_two(count: int) -> int:
+    return min(_BLOCK, max(64, 1 << (max(count, 1) - 1).bit_length()))
 
 
 @functools.cache
@@ -164,14 +167,25 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(count_cores(), "rays")
 
 
-@program
-def _joined(parts: tuple, count: int) -> Any:
-    return jax.tree.map(lambda *r: jnp.concatenate(r)[:count], *parts)
+def _joined(parts: list[Any], count: int) -> Any:
+    if checks.is_traced(parts) or on_accelerator():
+        return jax.tree.map(lambda *r: jnp.concatenate(r)[:count], *parts)
+    # Not by JAX, which would make a program for every count.
+    return jax.device_put(jax.tree.map(lambda *r: np.concatenate(r)[:count], *parts))
 
 
 @program
-def _jitted(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
-    return _in_bundles(function, scene, arrays)
+def _jitted(function: Callable, scene: Any, arrays: tuple[Any, ...], used: Any) -> Any:
+    """Of the bundles of a block those that are used: the rest of the results is 0."""
+    count = len(arrays[0])
+    if count <= _BUNDLE:
+        return function(scene, *arrays)
+    bundles = tuple(a.reshape(-1, _BUNDLE, *a.shape[1:]) for a in arrays)
+    one = lambda number: function(scene, *(b[number] for b in bundles))
+    nothing = jax.tree.map(lambda r: jnp.zeros((count // _BUNDLE, *r.shape), r.dtype), jax.eval_shape(one, 0))
+    put = lambda number, results: jax.tree.map(lambda r, new: r.at[number].set(new), results, one(number))
+    results = lax.fori_loop(0, jnp.minimum(used, count // _BUNDLE), put, nothing)
+    return jax.tree.map(lambda r: r.reshape(count, *r.shape[2:]), results)
 
 
 @program

@@ -29,8 +29,9 @@ from ..arrays import as_jax
 from ..keep import keep
 from ..layout import AXES, Layout, Ordinates, Reads
 from ..memory import give_back_freed
+from ..threads import count_cores
 from .characteristic import Inflow
-from .cores import count_cores, on_cores, on_cpu
+from .cores import on_cores, on_cpu
 from .step import thin_limit
 
 if TYPE_CHECKING:
