@@ -23,9 +23,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from .arrays import on_accelerator
 from .lattice import Lattice
 from .programs import program
 from .shapes import Shape, dot, greatest, least
+from .threads import count_cores, on_threads
 
 #: Voxels: centres this near to a surface may have it in their voxel.
 NEAR = 0.5 * np.sqrt(3) + 0.1
@@ -39,7 +41,8 @@ _AT_SURFACE = 0.02  # voxels: points that were moved to the surface are on it
 _NEARLY_FLAT = 0.1  # voxels: how far a plane's distance may be off at the corners of a voxel without creases
 _CURVED = 1e-6  # voxels: surfaces further from their planes than this
 _SLIVER = 0.1  # voxel faces: patches smaller than this
-_POINTS = 1 << 16  # evaluated at once: one size, for one compilation, whose arrays fit a cache
+_POINTS = 1 << 16  # evaluated by one call: one size, for one compilation
+_CHUNK = 1 << 10  # at once: their arrays fit a core's cache
 _VOXELS = _POINTS // 64  # voxels with as many samples
 _PLANES = 960  # planes with a few less in their voxels: on average each has 64
 _STEPS = np.linspace(-0.9, 0.9, 37)  # voxels: where a face is looked for along its normal
@@ -62,22 +65,31 @@ class DistanceField:
     def nearest(self, points: np.ndarray) -> np.ndarray:
         return self._batched(_nearest, points)
 
-    def raw_distance(self, points: Float[Array, "n 3"]) -> Float[Array, " n"]:
-        """Of `_POINTS` points, in scene units."""
-        return _least(self._shapes, points)
+    def raw_distance(self, points: Float[Array, "n 3"], used: int) -> Float[Array, " n"]:
+        """Of the first so many of `_POINTS` points, in scene units."""
+        return _least(self._shapes, points, _chunks(used))
 
-    def raw_gradient(self, points: Float[Array, "n 3"]) -> tuple[Float[Array, " n"], Float[Array, "n 3"]]:
-        """Of `_POINTS` points, with the distance in scene units."""
-        return _slope(self._shapes, points)
+    def raw_gradient(self, points: Float[Array, "n 3"], used: int) -> tuple[Float[Array, " n"], Float[Array, "n 3"]]:
+        """Of the first so many of `_POINTS` points, with the distance in scene units."""
+        return _slope(self._shapes, points, _chunks(used))
 
     def _batched(self, function: Callable, points: np.ndarray) -> Any:
         shape = points.shape[:-1]
         flat = points.reshape(-1, 3)
-        parts = [
-            jax.tree.map(np.asarray, function(self._shapes, _padded(flat[i : i + _POINTS], _POINTS)))
-            for i in range(0, max(len(flat), 1), _POINTS)
-        ]
-        return jax.tree.map(lambda *a: np.concatenate(a)[: len(flat)].reshape(*shape, *a[0].shape[1:]), *parts)
+        # Each core its part, of whole chunks.
+        part = min(_POINTS, _CHUNK * max(1, -(-len(flat) // (_CHUNK * count_cores()))))
+
+        def read(rows: np.ndarray) -> Any:
+            found = function(self._shapes, _padded(rows, _POINTS), _chunks(len(rows)))
+            return jax.tree.map(lambda a: np.asarray(a)[: len(rows)], found)
+
+        blocks = [flat[i : i + part] for i in range(0, max(len(flat), 1), part)]
+        parts = on_threads(_readers(), read, blocks) if len(blocks) > 1 else [read(flat)]
+        return jax.tree.map(lambda *a: np.concatenate(a).reshape(*shape, *a[0].shape[1:]), *parts)
+
+
+def _chunks(used: int) -> np.ndarray:
+    return np.array(-(-used // _CHUNK), np.int32)
 
 
 def _padded(rows: np.ndarray, size: int) -> np.ndarray:
@@ -90,36 +102,54 @@ def _padded(rows: np.ndarray, size: int) -> np.ndarray:
 def _in_blocks(function: Callable, rows: tuple[np.ndarray, ...], size: int) -> list[Any]:
     """function(*block) for blocks of rows, some at once: the host works on one while a program runs for another."""
     blocks = [tuple(a[i : i + size] for a in rows) for i in range(0, max(len(rows[0]), 1), size)]
-    # Contexts hold for one thread only.
-    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
-
-    def run(block: tuple[np.ndarray, ...]) -> Any:
-        with jax.enable_x64(True), jax.default_device(device):
-            return function(*block)
-
+    if len(blocks) < 2:
+        return [function(*block) for block in blocks]
     # The first one alone, for its programs to be compiled once.
-    return [run(blocks[0]), *_pool().map(run, blocks[1:])] if len(blocks) > 2 else [*map(run, blocks)]
+    return [function(*blocks[0]), *on_threads(_workers(), function, *zip(*blocks[1:], strict=True))]
 
 
 @functools.cache
-def _pool() -> ThreadPoolExecutor:
+def _workers() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(2, "surfaces")
+
+
+@functools.cache
+def _readers() -> ThreadPoolExecutor:
+    """For what workers wait for."""
+    return ThreadPoolExecutor(count_cores(), "distances")
 
 
 # Programs that scenes of like shapes share.
 
 
-def _union(shapes: tuple, points: Array) -> Array:
-    return least(tuple(shape.distance(points) for shape in shapes))
+@program
+def _least(shapes: tuple, points: Array, chunks: Array) -> Array:
+    return _of_chunks(lambda points: least(tuple(shape.distance(points) for shape in shapes)), points, chunks)
 
 
 @program
-def _least(shapes: tuple, points: Array) -> Array:
-    return _union(shapes, points)
+def _slope(shapes: tuple, points: Array, chunks: Array) -> tuple[Array, Array]:
+    return _of_chunks(functools.partial(_slope_of_all, shapes), points, chunks)
 
 
 @program
-def _slope(shapes: tuple, points: Array) -> tuple[Array, Array]:
+def _nearest(shapes: tuple, points: Array, chunks: Array) -> Array:
+    return _of_chunks(lambda points: jnp.argmin(jnp.stack([s.distance(points) for s in shapes]), 0), points, chunks)
+
+
+def _of_chunks(function: Callable, points: Array, chunks: Array) -> Any:
+    """function(points) of the first so many chunks, and 0 of the rest; each of what a core's nearest cache holds."""
+    if on_accelerator():
+        return function(points)
+    count = len(points) // _CHUNK
+    points = points.reshape(count, _CHUNK, 3)
+    nothing = jax.tree.map(lambda r: jnp.zeros((count, *r.shape), r.dtype), jax.eval_shape(function, points[0]))
+    put = lambda i, found: jax.tree.map(lambda r, new: r.at[i].set(new), found, function(points[i]))
+    found = lax.fori_loop(0, jnp.minimum(chunks, count), put, nothing)
+    return jax.tree.map(lambda r: r.reshape(-1, *r.shape[2:]), found)
+
+
+def _slope_of_all(shapes: tuple, points: Array) -> tuple[Array, Array]:
     # One by one, so that XLA does not work each out anew wherever their least is asked for.
     parts = [lax.optimization_barrier(_slope_of(shape, points)) for shape in shapes]
     values = tuple(value for value, _ in parts)
@@ -132,11 +162,6 @@ def _slope_of(shape: Shape, points: Array) -> tuple[Array, list[Array]]:
     axes = [jnp.broadcast_to(np.eye(3, dtype=points.dtype)[axis], points.shape) for axis in range(3)]
     found = [jax.jvp(shape.distance, (points,), (axis,)) for axis in axes]
     return found[0][0], [rate for _, rate in found]
-
-
-@program
-def _nearest(shapes: tuple, points: Array) -> Array:
-    return jnp.argmin(jnp.stack([shape.distance(points) for shape in shapes]), 0)
 
 
 def find_faces(field: DistanceField, voxels: Int[np.ndarray, "V 3"]) -> dict[str, np.ndarray]:
@@ -183,12 +208,12 @@ def _distinct_normals(field: DistanceField, center: np.ndarray) -> tuple[np.ndar
     spacing, index = field.spacing, np.arange(len(center))
 
     def near_samples(block: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        centers = _padded(block, _VOXELS)
+        centers, used = _padded(block, _VOXELS), 64 * len(block)
         points = slope = _samples(centers, spacing)
         for _ in range(2):  # project the samples on the surface
-            value, slope = field.raw_gradient(points)
+            value, slope = field.raw_gradient(points, used)
             points = _projected(points, value, slope)
-        near = _is_near(centers, points, field.raw_distance(points), spacing)
+        near = _is_near(centers, points, field.raw_distance(points, used), spacing)
         (chosen,) = np.nonzero(np.asarray(near)[: 64 * len(block)])
         return 64 * index[chosen // 64] + chosen % 64, np.asarray(points)[chosen], np.asarray(slope)[chosen]
 
@@ -296,8 +321,9 @@ def _plane_offset(field: DistanceField, center: np.ndarray, normal: np.ndarray) 
     for i in range(0, len(center), size):
         rows = center[i : i + size], normal[i : i + size]
         points = _along_normals(*(_padded(a, size) for a in rows), field.spacing)
-        value = np.asarray(field.raw_distance(points)) / field.spacing
-        (chosen,) = np.nonzero(np.abs(value[: len(rows[0]) * 64 * len(_STEPS)]) < 0.2)
+        used = len(rows[0]) * 64 * len(_STEPS)
+        value = np.asarray(field.raw_distance(points, used)) / field.spacing
+        (chosen,) = np.nonzero(np.abs(value[:used]) < 0.2)
         parts.append((chosen + i * 64 * len(_STEPS), np.asarray(points)[chosen], value[chosen]))
     if not parts:
         return offset
