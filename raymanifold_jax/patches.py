@@ -224,12 +224,12 @@ def _arriving(
     still, parts, unattenuated = _still(scene), [], []
     with worked_out_now():
         receiver, position, weight = _receivers(still, patches, surfaces, rows)
-    normal = surfaces.normal[rows][receiver]
+    normal, material = surfaces.normal[rows][receiver], surfaces.material[rows][receiver]
     for begin in range(0, len(receiver), _BLOCK):
-        facing, share = (values[begin : begin + _BLOCK] for values in (normal, weight))
+        facing, share, solid = (values[begin : begin + _BLOCK] for values in (normal, weight, material))
         start = position[begin : begin + _BLOCK] + CLEARANCE * facing
         with worked_out_now():
-            pairs = _seen(still, patches, start, facing)
+            pairs = _seen(still, patches, start, facing, solid)
         unattenuated.append(share * np.bincount(pairs.element, pairs.geometry, len(start)))
         parts.append(_light(scene, patches, pairs, start, radiance) * jnp.asarray(share, radiance.dtype))
     found = jnp.zeros((radiance.shape[0], len(rows)), radiance.dtype).at[:, receiver].add(jnp.concatenate(parts, -1))
@@ -268,8 +268,8 @@ def _receivers(scene: Scene, patches: _Patches, surfaces: Surfaces, rows: np.nda
     return receiver, np.concatenate([position[far], points[kept]]), np.concatenate([np.ones(len(far)), share])
 
 
-def _seen(scene: Scene, patches: _Patches, start: np.ndarray, facing: np.ndarray) -> _Pairs:
-    """Pairs of a block that see each other."""
+def _seen(scene: Scene, patches: _Patches, start: np.ndarray, facing: np.ndarray, solid: np.ndarray) -> _Pairs:
+    """Pairs of a block that see each other; `solid`: which one each row is of."""
     pairs = _narrow(patches, start, facing)
     if not scene.solids:
         return pairs
@@ -277,17 +277,23 @@ def _seen(scene: Scene, patches: _Patches, start: np.ndarray, facing: np.ndarray
     for number in range(_ROUNDS + 1):
         if not len(pairs.element):
             break
-        seen, surely = _looked_at(scene, patches, start, pairs)
+        seen, surely = _looked_at(scene, patches, start, solid, pairs)
         surely |= (patches.count[pairs.patch] == 0) | (pairs.geometry < _MINOR * total[pairs.element]) | (number == _ROUNDS)
         found.append(pairs.kept(surely & seen))
         pairs = _bright(_faced(patches, start, facing, *_opened(patches, pairs.kept(~surely))), total)
     return _Pairs.joined(found)
 
 
-def _looked_at(scene: Scene, patches: _Patches, start: np.ndarray, pairs: _Pairs) -> tuple[np.ndarray, np.ndarray]:
+def _looked_at(
+    scene: Scene, patches: _Patches, start: np.ndarray, solid: np.ndarray, pairs: _Pairs
+) -> tuple[np.ndarray, np.ndarray]:
     end = patches.target[pairs.patch] + CLEARANCE * patches.normal[pairs.patch]
-    radius = _RADIUS * patches.size[pairs.patch]
-    rays = start[pairs.element], end, radius
+    owner, solid = patches.owner[pairs.patch], solid[pairs.element]
+    # Convex solids do not hide what is before them. A mirror's image of one may; and past a curved patch's horizon it does.
+    plain = ((end > 0) & (end < scene.lattice.shape)).all(1) & (owner != solid)
+    flat = patches.turn[pairs.patch] == 0
+    ends = np.where(plain & flat, owner, -1), np.where(plain, solid, -1)
+    rays = start[pairs.element], end, _RADIUS * patches.size[pairs.patch], *ends
     sight = [np.array(values) for values in in_blocks(look_at_patch, scene, rays)]
     _, blocked, _, least, most, effort = sight
     for _ in range(ROUNDS - 1):

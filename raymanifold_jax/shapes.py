@@ -96,6 +96,11 @@ class Shape(eqx.Module):
         """
 
     @property
+    def convex(self) -> bool:
+        """Whether it is known to be: then no part of it hides another from a point before that other's face."""
+        return False
+
+    @property
     def roughness(self) -> Any:
         """How far the surface that rays find may be from the shape's own; 0.0 where it is known exactly."""
         parts = [part for value in vars(self).values() for part in (value if isinstance(value, tuple) else (value,))]
@@ -133,6 +138,10 @@ class Sphere(Shape):
         self.center = checks.vector3("center", center)
         self.radius = _length("radius", radius)
 
+    @property
+    def convex(self) -> bool:
+        return True
+
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         points, center, radius = _cast(points, self.center, self.radius)
         return safe_norm(points - center) - radius
@@ -156,6 +165,10 @@ class Box(Shape):
         if not checks.is_traced((self.lower, self.upper)) and not np.all(self.lower < self.upper):
             got = f"lower {self.lower.tolist()} and upper {self.upper.tolist()}"
             checks.fail("Box", got, "lower < upper on every axis", "swap the corners, or give the box a thickness")
+
+    @property
+    def convex(self) -> bool:
+        return True
 
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         points, lower, upper = _cast(points, self.lower, self.upper)
@@ -210,6 +223,10 @@ class Cylinder(Shape):
         if not checks.is_traced((self.start, self.end)) and np.array_equal(self.start, self.end):
             checks.fail("end", end, "a point other than start", "the two are the centres of the cylinder's flat ends")
 
+    @property
+    def convex(self) -> bool:
+        return True
+
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         points, start, end, radius = _cast(points, self.start, self.end, self.radius)
         length = safe_norm(end - start)
@@ -231,6 +248,10 @@ class HalfSpace(Shape):
     def __init__(self, point: Any, normal: Any):
         self.point = checks.vector3("point", point)
         self.normal = checks.unit_vector("normal", normal)
+
+    @property
+    def convex(self) -> bool:
+        return True
 
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         points, point, normal = _cast(points, self.point, self.normal)
@@ -267,6 +288,10 @@ class Intersection(Shape):
     def __init__(self, *shapes: Shape):
         self.shapes = _shapes("intersection", shapes)
 
+    @property
+    def convex(self) -> bool:
+        return all(shape.convex for shape in self.shapes)
+
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         return greatest(tuple(shape.distance(points) for shape in self.shapes))
 
@@ -301,6 +326,10 @@ class Translated(Shape):
         (self.shape,) = _shapes("translate", (shape,))
         self.offset = checks.vector3("offset", offset)
 
+    @property
+    def convex(self) -> bool:
+        return self.shape.convex
+
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         points, offset = _cast(points, self.offset)
         return self.shape.distance(points - offset)
@@ -324,6 +353,10 @@ class Rotated(Shape):
         angle = checks.finite("angle", angle, ())
         self.angle = np.asarray(angle, np.float64) if isinstance(angle, np.ndarray) else angle
         self.center = checks.vector3("center", center)
+
+    @property
+    def convex(self) -> bool:
+        return self.shape.convex
 
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         points, axis, angle, center = _cast(points, self.axis, self.angle, self.center)

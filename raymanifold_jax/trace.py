@@ -77,6 +77,18 @@ def _distance(scene: Scene, u: Array) -> Array:
     return scene.distance(to_scene(scene, u)) / scene.lattice.spacing
 
 
+def _distance_to_others(scene: Scene, u: Array, ends: tuple[Array, Array]) -> Array:
+    """The same, but for solids that are convex and lie at an end of the line of sight, whose numbers `ends` has."""
+    points = to_scene(scene, u)
+    far = jnp.full(u.shape[:1], max(scene.lattice.shape) * 2.0, u.dtype)
+    parts = []
+    for number, solid in enumerate(scene.solids):
+        apart = solid.shape.distance(points) / scene.lattice.spacing
+        own = (ends[0] == number) | (ends[1] == number)
+        parts.append(jnp.where(own, far, apart) if solid.shape.convex else apart)
+    return functools.reduce(jnp.minimum, parts)
+
+
 def trace_rays(scene: Scene, origins: Array, directions: Array) -> Hit:
     """`first_hit` for one block of rays."""
     axes = unfolded_axes(scene)
@@ -210,17 +222,27 @@ class Sight(NamedTuple):
     effort: Float[Array, " n"]  # about how many steps are left; 0 where it is over
 
 
-def look_at_patch(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"], radius: Float[Array, " n"]) -> Sight:
-    """The first steps from `o` to patches of a `radius` around `e`, in unfolded voxel coordinates; for one block."""
-    return _look(scene, o, e, radius, _nothing_seen(o), _ROUND)
+class Patch(NamedTuple):
+    """What lines of sight lead to, and from where: which solids these points are on, or -1, if they face each other there."""
+
+    radius: Float[Array, " n"]
+    solid: Float[Array, " n"]
+    from_solid: Float[Array, " n"]
 
 
-def go_on_looking(
-    scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"], radius: Float[Array, " n"], *sight: Array
-) -> Sight:
+def look_at_patch(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"], *patch: Array) -> Sight:
+    """The first steps from `o` to a `Patch` around `e`, in unfolded voxel coordinates; for one block.
+
+    A convex solid does not hide what is before it from its own points.
+    """
+    return _look(scene, o, e, Patch(*patch), _nothing_seen(o), _ROUND)
+
+
+def go_on_looking(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"], *patch_and_sight: Array) -> Sight:
     """The rest of the way. A block takes as long as its longest: best are those together that have as much before them."""
-    t, blocked, free, least, most, effort = sight
-    return _look(scene, o, e, radius, Sight(t, blocked > 0, free > 0, least, most, effort), _ROUND)
+    radius, solid, from_solid, t, blocked, free, least, most, effort = patch_and_sight
+    sight = Sight(t, blocked > 0, free > 0, least, most, effort)
+    return _look(scene, o, e, Patch(radius, solid, from_solid), sight, _ROUND)
 
 
 def _nothing_seen(o: Array) -> Sight:
@@ -228,11 +250,16 @@ def _nothing_seen(o: Array) -> Sight:
     return Sight(zero, none, none, zero + jnp.inf, zero - jnp.inf, zero)
 
 
-def _look(scene: Scene, o: Array, e: Array, radius: Array | None, sight: Sight, steps: int) -> Sight:
+def _look(scene: Scene, o: Array, e: Array, patch: Patch | None, sight: Sight, steps: int) -> Sight:
     """So many steps more, at most, along lines of sight that are not over."""
     axes = unfolded_axes(scene)
     folds = any(axis.kind != "plain" for axis in axes)
-    distance = lambda u: _distance(scene, fold(axes, u)[0] if folds else u)
+    radius = None if patch is None else patch.radius
+
+    def distance(u: Array) -> Array:
+        u = fold(axes, u)[0] if folds else u
+        return _distance(scene, u) if patch is None else _distance_to_others(scene, u, (patch.solid, patch.from_solid))
+
     length = jnp.sqrt(jnp.sum((e - o) ** 2, -1))
     w = (e - o) / jnp.where(length > 0, length, 1.0)[:, None]
     stop = length - _CRAWL

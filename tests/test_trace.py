@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import raymanifold_jax as rm
-from raymanifold_jax.trace import first_hit, march, transmittance, visible
+from raymanifold_jax.trace import first_hit, look_at_patch, march, transmittance, visible
 from raymanifold_jax.unfolding import in_blocks
 
 N = 16
@@ -203,6 +203,47 @@ def test_ends_on_surfaces_see_each_other():
         seen = np.asarray(visible(scene, start, end))
         clear = np.abs(cosine) > 0.05
         assert_close(seen[clear], (cosine > 0)[clear])
+
+
+def test_convex_solids_do_not_hide_what_is_before_them():
+    # Rays between points that face each other end as soon without the two's own solids as with them.
+    convex = [
+        rm.shapes.Box((0.1, 0.1, 0.05), (0.35, 0.4, 0.3)),
+        rm.shapes.Sphere((0.7, 0.3, 0.3), 0.15),
+        rm.shapes.Cylinder((0.3, 0.7, 0.2), (0.4, 0.75, 0.5), 0.1),
+        rm.shapes.Box((0.6, 0.6, 0.6), (0.9, 0.9, 0.7)).rotate((1, 2, 0), 0.5, (0.75, 0.75, 0.65)),
+        rm.shapes.Sphere((0.75, 0.75, 0.2), 0.2).intersection(rm.shapes.HalfSpace((0, 0, 0.25), (0, 0, 1))),
+    ]
+    hollow = rm.shapes.Torus((0.5, 0.5, 0.55), 0.2, 0.05)
+    assert all(shape.convex for shape in convex)
+    assert not hollow.convex
+    scene = rm.Scene(LATTICE, [rm.Solid(shape) for shape in [*convex, hollow]])
+    points, _ = rays(6000, lower=0.0, upper=1.0)
+    for _ in range(4):
+        value, pull_back = jax.vjp(scene.distance, jnp.asarray(points))
+        normal = np.asarray(pull_back(jnp.ones(len(points)))[0])
+        points = points - np.asarray(value)[:, None] * normal
+    on = (np.abs(np.asarray(scene.distance(jnp.asarray(points)))) < 1e-5) & (np.abs(np.linalg.norm(normal, axis=1) - 1) < 1e-3)
+    points, normal = points[on], normal[on]
+    points = points + 2e-3 * VOXEL * normal
+    solid = np.asarray(scene.solid_at(jnp.asarray(points)))
+    one, other = np.random.default_rng(1).integers(len(points), size=(2, 40000))
+    to = points[other] - points[one]
+    to /= np.maximum(np.linalg.norm(to, axis=1, keepdims=True), 1e-9)
+    ahead = np.minimum((to * normal[one]).sum(1), -(to * normal[other]).sum(1)) > 0.02
+    one, other = one[ahead & (solid[one] != solid[other])], other[ahead & (solid[one] != solid[other])]
+    assert len(one) > 2000
+    radius = np.full(len(one), 1e-3)
+    rest = lambda *ends: [
+        np.asarray(a) for a in in_blocks(look_at_patch, scene, (points[one] / VOXEL, points[other] / VOXEL, radius, *ends))
+    ]
+    nobody = np.full(len(one), -1)
+    with_all, without = rest(nobody, nobody), rest(solid[other], solid[one])
+    assert 0.1 < without[1].mean() < 0.9
+    done = with_all[-1] == 0
+    assert done.mean() > 0.9
+    assert np.mean(with_all[1][done] != without[1][done]) < 2e-3
+    assert without[-1].sum() < with_all[-1].sum()  # and there is less left to do
 
 
 def test_a_plane_sees_along_itself():
