@@ -36,7 +36,7 @@ from .unfolding import in_blocks, mirror_images, unfolded_axes
 _WIDTH = 0.35  # of a patch, at most, for its distance
 _FINER = 4.0  # times, where only a part of a curved patch can be seen
 _ROUNDS = 5  # of taking parts instead, where not all of a patch may be seen
-_RADIUS = 0.8  # of a patch, for its size
+_RADIUS = 0.8  # of a curved patch, for its size
 _FACES = 8  # along an element's side; half of it where there are many
 _MANY = 4096
 _NEXT = 2.0  # voxels: elements nearer to an emitter than this are looked at in more points than their middles
@@ -55,7 +55,8 @@ _FOUR = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
 class _Patches(NamedTuple):
     """Patches of all sizes; lengths are in voxels, positions in unfolded voxel coordinates."""
 
-    size: Float[np.ndarray, " n"]
+    size: Float[np.ndarray, " n"]  # their longest side
+    radius: Float[np.ndarray, " n"]  # around the centre
     center: Float[np.ndarray, "n 3"]
     normal: Float[np.ndarray, "n 3"]
     arms: Float[np.ndarray, "n 2 3"]  # from the centre to two of the four points
@@ -65,6 +66,7 @@ class _Patches(NamedTuple):
     target: Float[np.ndarray, "n 3"]  # where its ray ends
     first: Int[np.ndarray, " n"]  # its parts: rows first to first + count; none of the smallest
     count: Int[np.ndarray, " n"]
+    topmost: Bool[np.ndarray, " n"]  # no parts of others
 
 
 class _Pairs(NamedTuple):
@@ -144,7 +146,7 @@ def _conserving(
 
 
 def _patches(scene: Scene, faces: EmittingFaces, side: int) -> _Patches:
-    """From the smallest to the one or the few that nothing can be joined to, which come last."""
+    """From the smallest to the one or the few that nothing can be joined to."""
     spacing = scene.lattice.spacing
     faces = faces._replace(position=(faces.position - scene.lattice.lower) / spacing, area=faces.area / spacing**2)
     faces = _with_images(scene, faces)
@@ -152,8 +154,9 @@ def _patches(scene: Scene, faces: EmittingFaces, side: int) -> _Patches:
     two = frames(faces.normal)[:, :2]
     moments = np.einsum("nki,nkj->nij", two, two) * (size**2 / 12) + faces.position[:, :, None] * faces.position[:, None]
     none = np.zeros(len(faces.area), int)
-    steps = [_of_size(size, faces.position, faces.normal, moments, faces.area, faces.owner, faces.position, none, none)]
-    code = (np.round(2 * faces.normal).astype(int) + 2) @ np.array([25, 5, 1])
+    flat = np.zeros(len(faces.area))
+    steps = [_of_size(size, faces.position, faces.normal, moments, faces.area, flat, faces.owner, faces.position, none, none)]
+    code, begin = (np.round(2 * faces.normal).astype(int) + 2) @ np.array([25, 5, 1]), 0
     while size < 2 * max(scene.lattice.shape) and len(steps[-1].area) > 1:
         size *= 2
         # Counted from the middle either way, so that a turned scene has the turned patches.
@@ -166,16 +169,22 @@ def _patches(scene: Scene, faces: EmittingFaces, side: int) -> _Patches:
         order = np.argsort(key, kind="stable")
         parts = steps[-1] = _Patches(*(values[order] for values in steps[-1]))
         first = np.nonzero(np.diff(key[order], prepend=-1))[0]
-        moments, target = _joined(parts, moments[order], first)
-        steps.append(target._replace(size=np.full(len(first), size)))
+        moments, joined = _joined(parts, moments[order], first, size)
+        # What has one part is that part, whose own parts it has.
+        alone, begin = joined.count == 1, begin + len(parts.area)
+        joined = joined._replace(first=joined.first + begin - len(parts.area))
+        steps.append(_Patches(*(_where(alone, whole[first], new) for whole, new in zip(parts, joined, strict=True))))
         code = code[order][first]
-    # One table: parts are numbered from the beginning of all.
-    begins = np.cumsum([0, 0, *(len(step.area) for step in steps)])
-    steps = [step._replace(first=step.first + begin) for step, begin in zip(steps, begins, strict=False)]
-    return _Patches(*(np.concatenate(values) for values in zip(*steps, strict=True)))
+    patches = _Patches(*(np.concatenate(values) for values in zip(*steps, strict=True)))
+    return patches._replace(topmost=np.arange(len(patches.area)) >= begin)
 
 
-def _joined(parts: _Patches, moments: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, _Patches]:
+def _where(chosen: np.ndarray, ones: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Rows of one or the other."""
+    return np.where(chosen.reshape(-1, *[1] * (ones.ndim - 1)), ones, others)
+
+
+def _joined(parts: _Patches, moments: np.ndarray, first: np.ndarray, size: float) -> tuple[np.ndarray, _Patches]:
     """Patches of the parts from each `first` on up to the next, and their moments."""
     count = np.diff(first, append=len(parts.area))
     total = np.add.reduceat(parts.area, first)
@@ -191,18 +200,21 @@ def _joined(parts: _Patches, moments: np.ndarray, first: np.ndarray) -> tuple[np
     turned = np.arccos(np.clip((parts.normal * normal[whole]).sum(1), -1, 1))
     turn = np.maximum.reduceat(parts.turn + np.where(turned > 1e-3, turned, 0.0), first)
     target = np.where((turn > 0)[:, None], parts.target[nearest], center)
-    patches = _of_size(0.0, center, normal, moments, area, parts.owner[first], target, first, count)
-    return moments, patches._replace(turn=turn)
+    return moments, _of_size(size, center, normal, moments, area, turn, parts.owner[first], target, first, count)
 
 
-def _of_size(size: float, center, normal, moments, area, owner, target, first, count) -> _Patches:
-    """`moments` are means of the products of coordinates."""
+def _of_size(size: float, center, normal, moments, area, turn, owner, target, first, count) -> _Patches:
+    """At most of this `size`; `moments` are means of the products of coordinates."""
     two = frames(normal)[:, :2]
     spread = np.einsum("nki,nij,nkj->nk", two, moments - center[:, :, None] * center[:, None], two)
     # Four points at sqrt(2) times the deviations have the patch's second moments.
-    arms = two * np.sqrt(2 * np.maximum(spread, 0.0))[..., None]
-    sizes, flat = np.full(len(area), size), np.zeros(len(area))
-    return _Patches(sizes, center, normal, arms, area, flat, owner, target, first, count)
+    arms = np.sqrt(2 * np.maximum(spread, 0.0))
+    # A rectangle's sides, and half of its diagonal.
+    sides = np.minimum(np.sqrt(6) * arms, size)
+    longest = np.where(turn > 0, size, sides.max(1))
+    radius = np.where(turn > 0, _RADIUS * size, np.sqrt((sides**2).sum(1)) / 2)
+    topmost = np.zeros(len(area), bool)
+    return _Patches(longest, radius, center, normal, two * arms[..., None], area, turn, owner, target, first, count, topmost)
 
 
 def _with_images(scene: Scene, faces: EmittingFaces) -> EmittingFaces:
@@ -293,7 +305,7 @@ def _looked_at(
     plain = ((end > 0) & (end < scene.lattice.shape)).all(1) & (owner != solid)
     flat = patches.turn[pairs.patch] == 0
     ends = np.where(plain & flat, owner, -1), np.where(plain, solid, -1)
-    rays = start[pairs.element], end, _RADIUS * patches.size[pairs.patch], *ends
+    rays = start[pairs.element], end, patches.radius[pairs.patch], *ends
     sight = [np.array(values) for values in in_blocks(look_at_patch, scene, rays)]
     _, blocked, _, least, most, effort = sight
     for _ in range(ROUNDS - 1):
@@ -309,7 +321,7 @@ def _looked_at(
 
 def _narrow(patches: _Patches, start: np.ndarray, facing: np.ndarray) -> _Pairs:
     """For each row the largest patches that are narrow enough, of those that lie before it and face it."""
-    (top,) = np.nonzero(patches.size == patches.size[-1])
+    (top,) = np.nonzero(patches.topmost)
     pairs = np.repeat(np.arange(len(start)), len(top)), np.tile(top, len(start))
     found = []
     while len(pairs[0]):
