@@ -22,11 +22,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from . import checks
-from .arrays import worked_out_now
 from .march import transmittance
 from .programs import program
 from .scene import MIRROR, PERIODIC, PointLight, Scene
-from .surfaces import Surfaces, patch_points
+from .surfaces import Surfaces, distance_to_solids, patch_points
 from .texture import Texture
 from .trace import share_that_passes, visible
 from .unfolding import in_blocks, mirror_images
@@ -101,8 +100,7 @@ def emitting_faces(scene: Scene, surfaces: Surfaces, side: int) -> EmittingFaces
     behind = np.ones(weight.shape, bool)
     if flush.any():
         inside = position[flush] - 0.02 * spacing * normal[flush]
-        with worked_out_now():
-            behind[flush] = np.asarray(scene.distance(jnp.asarray(inside))) < 0
+        behind[flush] = distance_to_solids(scene, inside) < 0
     weight = np.where(behind, weight, 0.0)
     alone = ~weight.any(1)  # with so small a face that none of its points is in the voxel
     position[alone, 0], weight[alone, 0] = surfaces.position[emitters[alone]], 1.0

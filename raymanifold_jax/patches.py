@@ -29,7 +29,7 @@ from .emitters import CLEARANCE, SMALL, EmittingFaces, emitting_faces, share_tha
 from .march import transmittance_unfolded
 from .programs import program
 from .scene import OPEN, Scene, Wall
-from .surfaces import Surfaces, patch_points
+from .surfaces import Surfaces, distance_to_solids, patch_points
 from .trace import ROUNDS, go_on_looking, look_at_patch
 from .unfolding import in_blocks, mirror_images, unfolded_axes
 
@@ -49,7 +49,6 @@ _SAMPLE = 256
 _MOST = 0.5  # of the surfaces
 _TOLERANCE = 3e-3  # rms over elements, of their mean: what the sweep's directions may be off
 _CODES = 125  # of normals: what faces about the same way has the same
-_FOUR = np.array([(1, 0), (-1, 0), (0, 1), (0, -1)])
 
 
 class _Patches(NamedTuple):
@@ -234,8 +233,7 @@ def _arriving(
 ) -> tuple[Float[Array, "C n"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """The mean irradiance of some elements; what it would be without a medium, of radiance 1; which are next to emitters."""
     still, parts, unattenuated = _still(scene), [], []
-    with worked_out_now():
-        receiver, position, weight = _receivers(still, patches, surfaces, rows)
+    receiver, position, weight = _receivers(still, patches, surfaces, rows)
     normal, material = surfaces.normal[rows][receiver], surfaces.material[rows][receiver]
     for begin in range(0, len(receiver), _BLOCK):
         facing, share, solid = (values[begin : begin + _BLOCK] for values in (normal, weight, material))
@@ -271,7 +269,7 @@ def _receivers(scene: Scene, patches: _Patches, surfaces: Surfaces, rows: np.nda
     points = points + (surfaces.voxel[rows[near]] + 0.5)[:, None]
     if scene.solids and len(near):  # what another solid covers of a face is none of it
         outside = scene.lattice.lower + (points + 0.02 * normal[:, None]) * scene.lattice.spacing
-        weight = np.where(np.asarray(scene.distance(jnp.asarray(outside))) > 0, weight, 0.0)
+        weight = np.where(distance_to_solids(scene, outside) > 0, weight, 0.0)
     alone = ~weight.any(1)
     points[alone, 0], weight[alone, 0] = position[near[alone]], 1.0
     kept = weight > 0
@@ -289,23 +287,24 @@ def _seen(scene: Scene, patches: _Patches, start: np.ndarray, facing: np.ndarray
     for number in range(_ROUNDS + 1):
         if not len(pairs.element):
             break
-        seen, surely = _looked_at(scene, patches, start, solid, pairs)
-        surely |= (patches.count[pairs.patch] == 0) | (pairs.geometry < _MINOR * total[pairs.element]) | (number == _ROUNDS)
+        whole = (patches.count[pairs.patch] == 0) | (pairs.geometry < _MINOR * total[pairs.element]) | (number == _ROUNDS)
+        seen, surely = _looked_at(scene, patches, start, solid, pairs, whole)
         found.append(pairs.kept(surely & seen))
         pairs = _bright(_faced(patches, start, facing, *_opened(patches, pairs.kept(~surely))), total)
     return _Pairs.joined(found)
 
 
 def _looked_at(
-    scene: Scene, patches: _Patches, start: np.ndarray, solid: np.ndarray, pairs: _Pairs
+    scene: Scene, patches: _Patches, start: np.ndarray, solid: np.ndarray, pairs: _Pairs, whole: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Which patches' targets are seen, and whether all of each is as its target, or is to be taken as a `whole`."""
     end = patches.target[pairs.patch] + CLEARANCE * patches.normal[pairs.patch]
     owner, solid = patches.owner[pairs.patch], solid[pairs.element]
     # Convex solids do not hide what is before them. A mirror's image of one may; and past a curved patch's horizon it does.
     plain = ((end > 0) & (end < scene.lattice.shape)).all(1) & (owner != solid)
     flat = patches.turn[pairs.patch] == 0
     ends = np.where(plain & flat, owner, -1), np.where(plain, solid, -1)
-    rays = start[pairs.element], end, patches.radius[pairs.patch], *ends
+    rays = start[pairs.element], end, np.where(whole, 0.0, patches.radius[pairs.patch]), *ends
     sight = [np.array(values) for values in in_blocks(look_at_patch, scene, rays)]
     _, blocked, _, least, most, effort = sight
     for _ in range(ROUNDS - 1):
@@ -316,7 +315,7 @@ def _looked_at(
         rest = in_blocks(go_on_looking, scene, tuple(values[late] for values in (*rays, *sight)))
         for values, found in zip(sight, rest, strict=True):
             values[late] = found
-    return ~blocked, np.where(blocked, most > 0, least > 0)
+    return ~blocked, whole | np.where(blocked, most > 0, least > 0)
 
 
 def _narrow(patches: _Patches, start: np.ndarray, facing: np.ndarray) -> _Pairs:
@@ -327,9 +326,9 @@ def _narrow(patches: _Patches, start: np.ndarray, facing: np.ndarray) -> _Pairs:
     while len(pairs[0]):
         element, patch = pairs
         to = patches.center[patch] - start[element]
-        size, distance = patches.size[patch], np.sqrt((to**2).sum(-1))
-        ahead = (to * facing[element]).sum(-1) > -size
-        cosine = -(to * patches.normal[patch]).sum(-1) / distance
+        size, distance = patches.size[patch], np.sqrt(np.einsum("ni,ni->n", to, to))
+        ahead = np.einsum("ni,ni->n", to, facing[element]) > -size
+        cosine = -np.einsum("ni,ni->n", to, patches.normal[patch]) / distance
         within = np.sin(np.minimum(patches.turn[patch], np.pi / 2)) + size / distance  # of its horizon
         ahead &= cosine > -within
         at_horizon = (patches.turn[patch] > 0) & (cosine < within)
@@ -349,14 +348,16 @@ def _opened(patches: _Patches, pairs: _Pairs) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _faced(patches: _Patches, start: np.ndarray, facing: np.ndarray, element: np.ndarray, patch: np.ndarray) -> _Pairs:
-    mean, middle = 0.0, patches.center[patch] - start[element]
-    normal, arms, towards = patches.normal[patch], patches.arms[patch], facing[element]
-    for one, other in _FOUR:
-        to = middle + one * arms[:, 0] + other * arms[:, 1]
-        squared = np.maximum((to**2).sum(-1), 0.05**2)
-        cosines = np.maximum((to * towards).sum(-1), 0) * np.maximum(-(to * normal).sum(-1), 0)
-        mean = mean + cosines / squared**2 / len(_FOUR)
-    return _Pairs(element, patch, patches.area[patch] * mean)
+    dot = lambda a, b: np.einsum("ni,ni->n", a, b)
+    middle, towards = patches.center[patch] - start[element], facing[element]
+    apart, ahead, leaving = dot(middle, middle), dot(middle, towards), -dot(middle, patches.normal[patch])
+    mean = 0.0
+    for arm in (patches.arms[patch, 0], patches.arms[patch, 1]):  # across the normal: all four points are as far below
+        along, rise, reach = dot(middle, arm), dot(arm, towards), dot(arm, arm)
+        for sense in (1, -1):
+            squared = np.maximum(apart + reach + 2 * sense * along, 0.05**2)
+            mean = mean + np.maximum(ahead + sense * rise, 0) / squared**2 / 4
+    return _Pairs(element, patch, patches.area[patch] * np.maximum(leaving, 0) * mean)
 
 
 def _bright(pairs: _Pairs, total: np.ndarray) -> _Pairs:

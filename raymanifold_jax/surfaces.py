@@ -6,7 +6,7 @@ the outward unit normal n, its area inside the voxel, and a material. Faces that
 the voxel on the solid side (offset = -1/2). Every side of the domain that is closed or open holds elements of the same kind
 in a layer of ghost voxels around the lattice: a wall reflects, an open side is black and lets the light of the sky in.
 
-Public: `Surfaces`, `find_surfaces`, `patch_points`.
+Public: `Surfaces`, `find_surfaces`, `distance_to_solids`, `patch_points`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ from collections.abc import Container
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
+from .arrays import worked_out_now
 from .faces import NEAR, DistanceField, find_faces
 from .faces import patch_points as patch_points
 from .lattice import Lattice
@@ -75,6 +77,12 @@ def find_surfaces(scene: Scene) -> Surfaces:
         parts = [_no_elements()]
     joined = {key: np.concatenate([p[key] for p in parts]) for key in parts[0]}
     return Surfaces(**joined, solid=solid)
+
+
+def distance_to_solids(scene: Scene, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, " *batch"]:
+    """Signed distance of known points to the solids, in voxels; also while JAX traces the scene's values."""
+    with worked_out_now(), jax.enable_x64(True):
+        return DistanceField(scene.lattice, [solid.shape for solid in scene.solids]).distance(points)
 
 
 def _elements(rows: dict[str, np.ndarray], side: int, is_open: bool) -> dict[str, np.ndarray]:

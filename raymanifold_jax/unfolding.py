@@ -32,7 +32,7 @@ from .threads import count_cores, on_threads
 
 _BLOCK = 1 << 14  # rays a call
 _BUNDLE = 1 << 10  # rays that step together: neighbours end at about the same time
-_SIZES = 1 << 7, _BUNDLE, _BLOCK
+_FEW = 1 << 7
 
 
 class Axis(NamedTuple):
@@ -140,7 +140,7 @@ def in_blocks(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
         return _in_bundles(function, scene, tuple(jnp.asarray(a, real) for a in arrays))
     count, known = len(arrays[0]), not checks.is_traced(scene)
     # Few sizes, each compiled once. Derivatives cannot leave bundles out.
-    block = min([size for size in _SIZES if size >= count] or [_BLOCK]) if known else _power_of_two(count)
+    block = (_FEW if count <= _FEW else _BLOCK) if known else _power_of_two(count)
     arrays = tuple(_padded(np.asarray(a, real), block, np) for a in arrays)
     blocks = [tuple(a[i : i + block] for a in arrays) for i in range(0, len(arrays[0]), block)]
 
