@@ -54,7 +54,7 @@ _CODES = 125  # of normals: what faces about the same way has the same
 class _Patches(NamedTuple):
     """Patches of all sizes; lengths are in voxels, positions in unfolded voxel coordinates."""
 
-    size: Float[np.ndarray, " n"]  # their longest side
+    size: Float[np.ndarray, " n"]  # of the cells that they are in
     radius: Float[np.ndarray, " n"]  # around the centre
     center: Float[np.ndarray, "n 3"]
     normal: Float[np.ndarray, "n 3"]
@@ -203,17 +203,15 @@ def _joined(parts: _Patches, moments: np.ndarray, first: np.ndarray, size: float
 
 
 def _of_size(size: float, center, normal, moments, area, turn, owner, target, first, count) -> _Patches:
-    """At most of this `size`; `moments` are means of the products of coordinates."""
+    """In cells of this `size`; `moments` are means of the products of coordinates."""
     two = frames(normal)[:, :2]
     spread = np.einsum("nki,nij,nkj->nk", two, moments - center[:, :, None] * center[:, None], two)
     # Four points at sqrt(2) times the deviations have the patch's second moments.
     arms = np.sqrt(2 * np.maximum(spread, 0.0))
-    # A rectangle's sides, and half of its diagonal.
-    sides = np.minimum(np.sqrt(6) * arms, size)
-    longest = np.where(turn > 0, size, sides.max(1))
-    radius = np.where(turn > 0, _RADIUS * size, np.sqrt((sides**2).sum(1)) / 2)
-    topmost = np.zeros(len(area), bool)
-    return _Patches(longest, radius, center, normal, two * arms[..., None], area, turn, owner, target, first, count, topmost)
+    # Half of a rectangle's diagonal.
+    radius = np.where(turn > 0, _RADIUS * size, np.sqrt(1.5 * (arms**2).sum(1)))
+    sizes, topmost = np.full(len(area), size), np.zeros(len(area), bool)
+    return _Patches(sizes, radius, center, normal, two * arms[..., None], area, turn, owner, target, first, count, topmost)
 
 
 def _with_images(scene: Scene, faces: EmittingFaces) -> EmittingFaces:
