@@ -77,7 +77,7 @@ class DistanceField:
         shape = points.shape[:-1]
         flat = points.reshape(-1, 3)
         # Each core its part, of whole chunks.
-        part = min(_POINTS, _CHUNK * max(1, -(-len(flat) // (_CHUNK * count_cores()))))
+        part = _POINTS if on_accelerator() else min(_POINTS, _CHUNK * max(1, -(-len(flat) // (_CHUNK * count_cores()))))
 
         def read(rows: np.ndarray) -> Any:
             found = function(self._shapes, _padded(rows, _POINTS), _chunks(len(rows)))

@@ -154,7 +154,9 @@ def _patches(scene: Scene, faces: EmittingFaces, side: int) -> _Patches:
     moments = np.einsum("nki,nkj->nij", two, two) * (size**2 / 12) + faces.position[:, :, None] * faces.position[:, None]
     none = np.zeros(len(faces.area), int)
     flat = np.zeros(len(faces.area))
-    steps = [_of_size(size, faces.position, faces.normal, moments, faces.area, flat, faces.owner, faces.position, none, none)]
+    radius = np.full(len(faces.area), size / np.sqrt(2))
+    known = moments, faces.area, flat, radius, faces.owner, faces.position, none, none
+    steps = [_of_size(size, faces.position, faces.normal, *known)]
     code, begin = (np.round(2 * faces.normal).astype(int) + 2) @ np.array([25, 5, 1]), 0
     while size < 2 * max(scene.lattice.shape) and len(steps[-1].area) > 1:
         size *= 2
@@ -199,19 +201,27 @@ def _joined(parts: _Patches, moments: np.ndarray, first: np.ndarray, size: float
     turned = np.arccos(np.clip((parts.normal * normal[whole]).sum(1), -1, 1))
     turn = np.maximum.reduceat(parts.turn + np.where(turned > 1e-3, turned, 0.0), first)
     target = np.where((turn > 0)[:, None], parts.target[nearest], center)
-    return moments, _of_size(size, center, normal, moments, area, turn, parts.owner[first], target, first, count)
+    # Flat ones reach as far as their parts, which may lie apart.
+    reach = np.maximum.reduceat(np.linalg.norm(parts.center - center[whole], axis=1) + parts.radius, first)
+    radius = np.where(turn > 0, _RADIUS * size, reach)
+    return moments, _of_size(size, center, normal, moments, area, turn, radius, parts.owner[first], target, first, count)
 
 
-def _of_size(size: float, center, normal, moments, area, turn, owner, target, first, count) -> _Patches:
+def _of_size(size: float, center, normal, moments, area, turn, radius, owner, target, first, count) -> _Patches:
     """In cells of this `size`; `moments` are means of the products of coordinates."""
     two = frames(normal)[:, :2]
-    spread = np.einsum("nki,nij,nkj->nk", two, moments - center[:, :, None] * center[:, None], two)
+    spread = np.einsum("nki,nij,nlj->nkl", two, moments - center[:, :, None] * center[:, None], two)
+    # Along their principal axes: a slender patch may lie askew.
+    (one, mixed), (_, other) = spread.transpose(1, 2, 0)
+    askew = np.abs(mixed) > 1e-9 * (one + other)
+    angle = np.where(askew, np.arctan2(2 * mixed, one - other) / 2, 0.0)
+    cos, sin = np.cos(angle), np.sin(angle)
+    turned = np.array([[cos, sin], [-sin, cos]]).transpose(2, 0, 1)
+    along = np.einsum("nki,nij,nkj->nk", turned, spread, turned)
     # Four points at sqrt(2) times the deviations have the patch's second moments.
-    arms = np.sqrt(2 * np.maximum(spread, 0.0))
-    # Half of a rectangle's diagonal.
-    radius = np.where(turn > 0, _RADIUS * size, np.sqrt(1.5 * (arms**2).sum(1)))
+    arms = (turned @ two) * np.sqrt(2 * np.maximum(along, 0.0))[..., None]
     sizes, topmost = np.full(len(area), size), np.zeros(len(area), bool)
-    return _Patches(sizes, radius, center, normal, two * arms[..., None], area, turn, owner, target, first, count, topmost)
+    return _Patches(sizes, radius, center, normal, arms, area, turn, owner, target, first, count, topmost)
 
 
 def _with_images(scene: Scene, faces: EmittingFaces) -> EmittingFaces:

@@ -98,7 +98,7 @@ class Shape(eqx.Module):
     @property
     def convex(self) -> bool:
         """Whether it is known to be: then no part of it hides another from a point before that other's face."""
-        return False
+        return type(self) in (Sphere, Box, Cylinder, HalfSpace)  # not what is derived from them
 
     @property
     def roughness(self) -> Any:
@@ -138,10 +138,6 @@ class Sphere(Shape):
         self.center = checks.vector3("center", center)
         self.radius = _length("radius", radius)
 
-    @property
-    def convex(self) -> bool:
-        return True
-
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         points, center, radius = _cast(points, self.center, self.radius)
         return safe_norm(points - center) - radius
@@ -165,10 +161,6 @@ class Box(Shape):
         if not checks.is_traced((self.lower, self.upper)) and not np.all(self.lower < self.upper):
             got = f"lower {self.lower.tolist()} and upper {self.upper.tolist()}"
             checks.fail("Box", got, "lower < upper on every axis", "swap the corners, or give the box a thickness")
-
-    @property
-    def convex(self) -> bool:
-        return True
 
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         points, lower, upper = _cast(points, self.lower, self.upper)
@@ -223,10 +215,6 @@ class Cylinder(Shape):
         if not checks.is_traced((self.start, self.end)) and np.array_equal(self.start, self.end):
             checks.fail("end", end, "a point other than start", "the two are the centres of the cylinder's flat ends")
 
-    @property
-    def convex(self) -> bool:
-        return True
-
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         points, start, end, radius = _cast(points, self.start, self.end, self.radius)
         length = safe_norm(end - start)
@@ -248,10 +236,6 @@ class HalfSpace(Shape):
     def __init__(self, point: Any, normal: Any):
         self.point = checks.vector3("point", point)
         self.normal = checks.unit_vector("normal", normal)
-
-    @property
-    def convex(self) -> bool:
-        return True
 
     def distance(self, points: Float[checks.Numbers, "*batch 3"]) -> Float[jax.Array, "*batch"]:
         points, point, normal = _cast(points, self.point, self.normal)

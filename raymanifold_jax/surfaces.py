@@ -80,7 +80,9 @@ def find_surfaces(scene: Scene) -> Surfaces:
 
 
 def distance_to_solids(scene: Scene, points: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, " *batch"]:
-    """Signed distance of known points to the solids, in voxels; also while JAX traces the scene's values."""
+    """Signed distance of known points to the solids, in voxels, also while JAX traces values; far if there are no solids."""
+    if not scene.solids:
+        return np.full(points.shape[:-1], 1e9)
     with worked_out_now(), jax.enable_x64(True):
         return DistanceField(scene.lattice, [solid.shape for solid in scene.solids]).distance(points)
 

@@ -8,6 +8,8 @@ import problems
 import pytest
 
 import raymanifold_jax as rm
+from raymanifold_jax import patches
+from raymanifold_jax.emitters import EmittingFaces
 
 FEW = rm.quadrature.fibonacci(100)  # a sweep's directions alone are off by some percent
 DARK = rm.Wall(0.0)
@@ -49,6 +51,51 @@ def test_a_ball_that_emits():
     error = np.asarray(surfaces.irradiance)[wall] / exact[wall] - 1
     assert np.sqrt(np.mean(error**2)) < 3e-3
     assert abs(error.mean()) < 2e-3
+
+
+def _faces(corner, one, other, parts):
+    """Small squares of a rectangle that two vectors span, seen from the side they turn to right-handed."""
+    corner, one, other = (np.asarray(vector, float) for vector in (corner, one, other))
+    a, b = ((np.arange(n) + 0.5) / n for n in parts)
+    position = corner + a[:, None, None] * one + b[:, None] * other
+    across = np.cross(one, other)
+    area = np.linalg.norm(across)
+    count = len(a) * len(b)
+    return position.reshape(-1, 3), np.tile(across / area, (count, 1)), np.full(count, area / count)
+
+
+_ASKEW = np.array([1, -1, 0]) / np.sqrt(2), np.array([-1, -1, 0]) / np.sqrt(2)
+
+
+@pytest.mark.parametrize(
+    "lamps",
+    [
+        pytest.param([((8, 14, 20), (6, 0, 0), (0, -6, 0), (48, 48))], id="square"),
+        pytest.param([((8, 14, 20), 8 * _ASKEW[0], 0.25 * _ASKEW[1], (64, 2))], id="strip"),
+        pytest.param(
+            [((9, 12, 20), (4, 0, 0), (0, -4, 0), (32, 32)), ((9, 12, 14), (4, 0, 0), (0, -4, 0), (32, 32))], id="stacked"
+        ),
+        pytest.param(
+            [((1, 4, 20), (3, 0, 0), (0, -3, 0), (24, 24)), ((15, 4, 20), (0.5, 0, 0), (0, -0.5, 0), (4, 4))], id="apart"
+        ),
+    ],
+)
+def test_patches_stand_for_their_faces(lamps):
+    # What elements of a floor take from patches is what they take from all faces; and patches reach as far as these.
+    scene = rm.Scene(rm.Lattice((24, 24, 24), 1.0))
+    position, normal, area = (np.concatenate(parts) for parts in zip(*(_faces(*lamp) for lamp in lamps), strict=True))
+    found = patches._patches(scene, EmittingFaces(position, normal, area, np.zeros(len(area), int)), 8)
+    for number in np.nonzero(found.count)[0]:
+        part = slice(found.first[number], found.first[number] + found.count[number])
+        reach = np.linalg.norm(found.center[part] - found.center[number], axis=1) + found.radius[part]
+        assert found.radius[number] >= reach.max() - 1e-9
+    start = np.stack(np.meshgrid(np.arange(0.5, 24, 2), np.arange(0.5, 24, 2), [0.0], indexing="ij"), -1).reshape(-1, 3)
+    facing = np.tile([0.0, 0.0, 1.0], (len(start), 1))
+    pairs = patches._narrow(found, start, facing)
+    taken = np.bincount(pairs.element, pairs.geometry, len(start))
+    to = position - start[:, None]
+    cosines = np.maximum(to[..., 2], 0) * np.maximum(-(to * normal).sum(-1), 0)
+    np.testing.assert_allclose(taken, (area * cosines / (to**2).sum(-1) ** 2).sum(1), rtol=2e-3)
 
 
 def test_emission_that_jit_traces():
