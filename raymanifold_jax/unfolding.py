@@ -32,7 +32,7 @@ from .threads import count_cores, on_threads
 
 _BLOCK = 1 << 14  # rays a call
 _BUNDLE = 1 << 10  # rays that step together: neighbours end at about the same time
-_FEW = 1 << 7
+_FEW = 1 << 7  # rays: no more are a call of their own
 
 
 class Axis(NamedTuple):
