@@ -24,6 +24,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from .arrays import on_accelerator
+from .chunks import of_first_chunks, padded
 from .lattice import Lattice
 from .programs import program
 from .shapes import Shape, dot, greatest, least
@@ -80,7 +81,7 @@ class DistanceField:
         part = _POINTS if on_accelerator() else min(_POINTS, _CHUNK * max(1, -(-len(flat) // (_CHUNK * count_cores()))))
 
         def read(rows: np.ndarray) -> Any:
-            found = function(self._shapes, _padded(rows, _POINTS), _chunks(len(rows)))
+            found = function(self._shapes, padded(rows, _POINTS), _chunks(len(rows)))
             return jax.tree.map(lambda a: np.asarray(a)[: len(rows)], found)
 
         blocks = [flat[i : i + part] for i in range(0, max(len(flat), 1), part)]
@@ -90,13 +91,6 @@ class DistanceField:
 
 def _chunks(used: int) -> np.ndarray:
     return np.array(-(-used // _CHUNK), np.int32)
-
-
-def _padded(rows: np.ndarray, size: int) -> np.ndarray:
-    if len(rows) == size:
-        return rows
-    last = rows[-1] if len(rows) else np.zeros(rows.shape[1:], rows.dtype)
-    return np.concatenate([rows, np.broadcast_to(last, (size - len(rows), *rows.shape[1:]))])
 
 
 def _in_blocks(function: Callable, rows: tuple[np.ndarray, ...], size: int) -> list[Any]:
@@ -138,15 +132,8 @@ def _nearest(shapes: tuple, points: Array, chunks: Array) -> Array:
 
 
 def _of_chunks(function: Callable, points: Array, chunks: Array) -> Any:
-    """function(points) of the first so many chunks, and 0 of the rest; each of what a core's nearest cache holds."""
-    if on_accelerator():
-        return function(points)
-    count = len(points) // _CHUNK
-    points = points.reshape(count, _CHUNK, 3)
-    nothing = jax.tree.map(lambda r: jnp.zeros((count, *r.shape), r.dtype), jax.eval_shape(function, points[0]))
-    put = lambda i, found: jax.tree.map(lambda r, new: r.at[i].set(new), found, function(points[i]))
-    found = lax.fori_loop(0, jnp.minimum(chunks, count), put, nothing)
-    return jax.tree.map(lambda r: r.reshape(-1, *r.shape[2:]), found)
+    """function(points) of the first so many chunks; each of what a core's nearest cache holds."""
+    return function(points) if on_accelerator() else of_first_chunks(function, (points,), _CHUNK, chunks)
 
 
 def _slope_of_all(shapes: tuple, points: Array) -> tuple[Array, Array]:
@@ -208,7 +195,7 @@ def _distinct_normals(field: DistanceField, center: np.ndarray) -> tuple[np.ndar
     spacing, index = field.spacing, np.arange(len(center))
 
     def near_samples(block: np.ndarray, index: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        centers, used = _padded(block, _VOXELS), 64 * len(block)
+        centers, used = padded(block, _VOXELS), 64 * len(block)
         points = slope = _samples(centers, spacing)
         for _ in range(2):  # project the samples on the surface
             value, slope = field.raw_gradient(points, used)
@@ -320,7 +307,7 @@ def _plane_offset(field: DistanceField, center: np.ndarray, normal: np.ndarray) 
     size = _POINTS // (64 * len(_STEPS))
     for i in range(0, len(center), size):
         rows = center[i : i + size], normal[i : i + size]
-        points = _along_normals(*(_padded(a, size) for a in rows), field.spacing)
+        points = _along_normals(*(padded(a, size) for a in rows), field.spacing)
         used = len(rows[0]) * 64 * len(_STEPS)
         value = np.asarray(field.raw_distance(points, used)) / field.spacing
         (chosen,) = np.nonzero(np.abs(value[:used]) < 0.2)
@@ -357,7 +344,7 @@ def _patches(
     """What there is of the faces on at most `_PLANES` planes: moved to the middle of their patches where not `creased`."""
     spacing, count = field.spacing, len(center)
     here = lambda a: np.asarray(a)[:count]
-    centers, normals, offsets, creases = (_padded(a, _PLANES) for a in (center, normal, offset, creased))
+    centers, normals, offsets, creases = (padded(a, _PLANES) for a in (center, normal, offset, creased))
     # Planes through the middle of their patch: the tangent at the point nearest the centre would stand proud of a ball.
     points, patch, weight = _on_planes(centers, normals, offsets, spacing)
     read = _Readings(field, points)

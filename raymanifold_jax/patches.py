@@ -30,7 +30,7 @@ from .march import transmittance_unfolded
 from .programs import program
 from .scene import OPEN, Scene, Wall
 from .surfaces import Surfaces, distance_to_solids, patch_points
-from .trace import ROUNDS, go_on_looking, look_at_patch
+from .trace import ROUNDS, Patch, go_on_looking, look_at_patch
 from .unfolding import in_blocks, mirror_images, unfolded_axes
 
 _WIDTH = 0.35  # of a patch, at most, for its distance
@@ -154,9 +154,12 @@ def _patches(scene: Scene, faces: EmittingFaces, side: int) -> _Patches:
     moments = np.einsum("nki,nkj->nij", two, two) * (size**2 / 12) + faces.position[:, :, None] * faces.position[:, None]
     none = np.zeros(len(faces.area), int)
     flat = np.zeros(len(faces.area))
-    radius = np.full(len(faces.area), size / np.sqrt(2))
-    known = moments, faces.area, flat, radius, faces.owner, faces.position, none, none
-    steps = [_of_size(size, faces.position, faces.normal, *known)]
+    smallest = _Patches(
+        size=np.full(len(flat), size), radius=np.full(len(flat), size / np.sqrt(2)), center=faces.position, normal=faces.normal,
+        arms=_arms(faces.position, faces.normal, moments), area=faces.area, turn=flat, owner=faces.owner,
+        target=faces.position, first=none, count=none, topmost=none > 0,
+    )  # fmt: skip
+    steps = [smallest]
     code, begin = (np.round(2 * faces.normal).astype(int) + 2) @ np.array([25, 5, 1]), 0
     while size < 2 * max(scene.lattice.shape) and len(steps[-1].area) > 1:
         size *= 2
@@ -200,15 +203,18 @@ def _joined(parts: _Patches, moments: np.ndarray, first: np.ndarray, size: float
     nearest = np.lexsort((off, whole))[first]
     turned = np.arccos(np.clip((parts.normal * normal[whole]).sum(1), -1, 1))
     turn = np.maximum.reduceat(parts.turn + np.where(turned > 1e-3, turned, 0.0), first)
-    target = np.where((turn > 0)[:, None], parts.target[nearest], center)
     # Flat ones reach as far as their parts, which may lie apart.
     reach = np.maximum.reduceat(np.linalg.norm(parts.center - center[whole], axis=1) + parts.radius, first)
-    radius = np.where(turn > 0, _RADIUS * size, reach)
-    return moments, _of_size(size, center, normal, moments, area, turn, radius, parts.owner[first], target, first, count)
+    return moments, _Patches(
+        size=np.full(len(first), size), radius=np.where(turn > 0, _RADIUS * size, reach), center=center, normal=normal,
+        arms=_arms(center, normal, moments), area=area, turn=turn, owner=parts.owner[first],
+        target=np.where((turn > 0)[:, None], parts.target[nearest], center), first=first, count=count,
+        topmost=np.zeros(len(first), bool),
+    )  # fmt: skip
 
 
-def _of_size(size: float, center, normal, moments, area, turn, radius, owner, target, first, count) -> _Patches:
-    """In cells of this `size`; `moments` are means of the products of coordinates."""
+def _arms(center: np.ndarray, normal: np.ndarray, moments: np.ndarray) -> Float[np.ndarray, "n 2 3"]:
+    """From the centre to two of the four points; `moments` are means of the products of coordinates."""
     two = frames(normal)[:, :2]
     spread = np.einsum("nki,nij,nlj->nkl", two, moments - center[:, :, None] * center[:, None], two)
     # Along their principal axes: a slender patch may lie askew.
@@ -218,10 +224,8 @@ def _of_size(size: float, center, normal, moments, area, turn, radius, owner, ta
     cos, sin = np.cos(angle), np.sin(angle)
     turned = np.array([[cos, sin], [-sin, cos]]).transpose(2, 0, 1)
     along = np.einsum("nki,nij,nkj->nk", turned, spread, turned)
-    # Four points at sqrt(2) times the deviations have the patch's second moments.
-    arms = (turned @ two) * np.sqrt(2 * np.maximum(along, 0.0))[..., None]
-    sizes, topmost = np.full(len(area), size), np.zeros(len(area), bool)
-    return _Patches(sizes, radius, center, normal, arms, area, turn, owner, target, first, count, topmost)
+    # At sqrt(2) times the deviations the four have the patch's second moments.
+    return (turned @ two) * np.sqrt(2 * np.maximum(along, 0.0))[..., None]
 
 
 def _with_images(scene: Scene, faces: EmittingFaces) -> EmittingFaces:
@@ -311,19 +315,18 @@ def _looked_at(
     # Convex solids do not hide what is before them. A mirror's image of one may; and past a curved patch's horizon it does.
     plain = ((end > 0) & (end < scene.lattice.shape)).all(1) & (owner != solid)
     flat = patches.turn[pairs.patch] == 0
-    ends = np.where(plain & flat, owner, -1), np.where(plain, solid, -1)
-    rays = start[pairs.element], end, np.where(whole, 0.0, patches.radius[pairs.patch]), *ends
-    sight = [np.array(values) for values in in_blocks(look_at_patch, scene, rays)]
-    _, blocked, _, least, most, effort = sight
+    radius = np.where(whole, 0.0, patches.radius[pairs.patch])
+    rays = start[pairs.element], end, Patch(radius, np.where(plain & flat, owner, -1), np.where(plain, solid, -1))
+    sight = jax.tree.map(np.array, in_blocks(look_at_patch, scene, rays))
     for _ in range(ROUNDS - 1):
         # Along a surface it takes ten times as many steps as the mean: those that do go on side by side, the longest first.
-        late = np.argsort(-effort)[: np.count_nonzero(effort)]
+        late = np.argsort(-sight.effort)[: np.count_nonzero(sight.effort)]
         if not len(late):
             break
-        rest = in_blocks(go_on_looking, scene, tuple(values[late] for values in (*rays, *sight)))
+        rest = in_blocks(go_on_looking, scene, jax.tree.map(lambda values, late=late: values[late], (*rays, sight)))
         for values, found in zip(sight, rest, strict=True):
             values[late] = found
-    return ~blocked, whole | np.where(blocked, most > 0, least > 0)
+    return ~sight.blocked, whole | np.where(sight.blocked, sight.most > 0, sight.least > 0)
 
 
 def _narrow(patches: _Patches, start: np.ndarray, facing: np.ndarray) -> _Pairs:

@@ -225,24 +225,22 @@ class Sight(NamedTuple):
 class Patch(NamedTuple):
     """What lines of sight lead to, and from where: which solids these points are on, or -1, if they face each other there."""
 
-    radius: Float[Array, " n"]
-    solid: Float[Array, " n"]
-    from_solid: Float[Array, " n"]
+    radius: Float[Any, " n"]
+    solid: Float[Any, " n"]
+    from_solid: Float[Any, " n"]
 
 
-def look_at_patch(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"], *patch: Array) -> Sight:
-    """The first steps from `o` to a `Patch` around `e`, in unfolded voxel coordinates; for one block.
+def look_at_patch(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"], patch: Patch) -> Sight:
+    """The first steps from `o` to a patch around `e`, in unfolded voxel coordinates; for one block.
 
     A convex solid does not hide what is before it from its own points.
     """
-    return _look(scene, o, e, Patch(*patch), _nothing_seen(o), _ROUND)
+    return _look(scene, o, e, patch, _nothing_seen(o), _ROUND)
 
 
-def go_on_looking(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"], *patch_and_sight: Array) -> Sight:
+def go_on_looking(scene: Scene, o: Float[Array, "n 3"], e: Float[Array, "n 3"], patch: Patch, sight: Sight) -> Sight:
     """The rest of the way. A block takes as long as its longest: best are those together that have as much before them."""
-    radius, solid, from_solid, t, blocked, free, least, most, effort = patch_and_sight
-    sight = Sight(t, blocked > 0, free > 0, least, most, effort)
-    return _look(scene, o, e, Patch(radius, solid, from_solid), sight, _ROUND)
+    return _look(scene, o, e, patch, sight, _ROUND)
 
 
 def _nothing_seen(o: Array) -> Sight:

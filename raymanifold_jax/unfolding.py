@@ -21,11 +21,11 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from . import checks
 from .arrays import on_accelerator, real_dtype
+from .chunks import of_chunks, of_first_chunks, padded
 from .programs import program
 from .scene import MIRROR, PERIODIC, Scene
 from .threads import count_cores, on_threads
@@ -134,28 +134,36 @@ def box_span(scene: Scene, u: Array, w: Array) -> tuple[Array, Array]:
 
 
 def in_blocks(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
-    """function(scene, *arrays) for arrays (n, ...), some rays at a time; results have n as their first axis."""
-    real = real_dtype()
+    """function(scene, *arrays) some rays at a time, for arrays (n, ...) or trees of them; results have n as their first axis.
+
+    All arrays but of truth values are made real.
+    """
     if checks.is_traced(arrays):
-        return _in_bundles(function, scene, tuple(jnp.asarray(a, real) for a in arrays))
-    count, known = len(arrays[0]), not checks.is_traced(scene)
+        return _in_bundles(function, scene, _real(arrays, jnp))
+    arrays = _real(arrays, np)
+    count, known = len(jax.tree.leaves(arrays)[0]), not checks.is_traced(scene)
     # Few sizes, each compiled once. Derivatives cannot leave bundles out.
     block = (_FEW if count <= _FEW else _BLOCK) if known else _power_of_two(count)
-    arrays = tuple(_padded(np.asarray(a, real), block, np) for a in arrays)
-    blocks = [tuple(a[i : i + block] for a in arrays) for i in range(0, len(arrays[0]), block)]
+    begins = range(0, max(count, 1), block)
+    arrays = jax.tree.map(lambda a: padded(a, block), arrays)
+    blocks = [jax.tree.map(lambda a, i=i: a[i : i + block], arrays) for i in begins]
 
-    def run(begin: int, rays: tuple[np.ndarray, ...]) -> Any:
+    def run(begin: int, rays: tuple[Any, ...]) -> Any:
         if not known:
             return _jitted_again(function, scene, rays)
         return _jitted(function, scene, rays, np.array(-(-(count - begin) // _BUNDLE), np.int32))
 
-    begins = range(0, len(arrays[0]), block)
     if len(blocks) > 2 and known and not on_accelerator():
         # The first block alone, for the program to be compiled once.
         parts = [run(0, blocks[0]), *on_threads(_pool(), run, begins[1:], blocks[1:])]
     else:
         parts = [*map(run, begins, blocks)]
-    return parts[0] if len(arrays[0]) == count == block else _joined(parts, count)
+    return parts[0] if count == block else _joined(parts, count)
+
+
+def _real(arrays: Any, xp: Any) -> Any:
+    real = lambda a: a if a.dtype in (bool, real_dtype()) else a.astype(real_dtype())
+    return jax.tree.map(lambda a: real(xp.asarray(a)), arrays, is_leaf=lambda a: isinstance(a, list))
 
 
 def _power_of_two(count: int) -> int:
@@ -169,23 +177,20 @@ def _pool() -> ThreadPoolExecutor:
 
 def _joined(parts: list[Any], count: int) -> Any:
     if checks.is_traced(parts) or on_accelerator():
-        return jax.tree.map(lambda *r: jnp.concatenate(r)[:count], *parts)
+        return _concatenated(parts, count)
     # Not by JAX, which would make a program for every count.
     return jax.device_put(jax.tree.map(lambda *r: np.concatenate(r)[:count], *parts))
 
 
 @program
+def _concatenated(parts: list[Any], count: int) -> Any:
+    return jax.tree.map(lambda *r: jnp.concatenate(r)[:count], *parts)
+
+
+@program
 def _jitted(function: Callable, scene: Any, arrays: tuple[Any, ...], used: Any) -> Any:
-    """Of the bundles of a block those that are used: the rest of the results is 0."""
-    count = len(arrays[0])
-    if count <= _BUNDLE:
-        return function(scene, *arrays)
-    bundles = tuple(a.reshape(-1, _BUNDLE, *a.shape[1:]) for a in arrays)
-    one = lambda number: function(scene, *(b[number] for b in bundles))
-    nothing = jax.tree.map(lambda r: jnp.zeros((count // _BUNDLE, *r.shape), r.dtype), jax.eval_shape(one, 0))
-    put = lambda number, results: jax.tree.map(lambda r, new: r.at[number].set(new), results, one(number))
-    results = lax.fori_loop(0, jnp.minimum(used, count // _BUNDLE), put, nothing)
-    return jax.tree.map(lambda r: r.reshape(count, *r.shape[2:]), results)
+    """Of the bundles of a block those that are used."""
+    return of_first_chunks(functools.partial(function, scene), arrays, _BUNDLE, used)
 
 
 @program
@@ -194,19 +199,5 @@ def _jitted_again(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> An
     return _in_bundles(jax.checkpoint(function), scene, arrays)  # pyright: ignore[reportPrivateImportUsage]
 
 
-def _in_bundles(function: Callable, scene: Any, arrays: tuple[Array, ...]) -> Any:
-    count = len(arrays[0])
-    if count <= _BUNDLE:
-        return function(scene, *arrays)
-    bundles = tuple(_padded(a, _BUNDLE, jnp).reshape(-1, _BUNDLE, *a.shape[1:]) for a in arrays)
-    results = lax.map(lambda parts: function(scene, *parts), bundles)
-    return jax.tree.map(lambda r: r.reshape(-1, *r.shape[2:])[:count], results)
-
-
-def _padded(values: Any, block: int, xp: Any) -> Any:
-    short = -len(values) % block if len(values) else block
-    if not short:
-        return values
-    # Rays like the last one: no longer to trace than the rest.
-    last = values[-1:] if len(values) else xp.ones((1, *values.shape[1:]), values.dtype)
-    return xp.concatenate([values, xp.broadcast_to(last, (short, *values.shape[1:]))])
+def _in_bundles(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
+    return of_chunks(functools.partial(function, scene), arrays, _BUNDLE)

@@ -5,6 +5,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+# Most of the tests' time goes into compiling programs that run once: without LLVM's optimisation it takes half as long, and
+# rounding is as strict. `XLA_FLAGS= pytest` runs programs as users do. Before JAX reads it; processes of tests inherit it.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+
 import jax
 import pytest
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import raymanifold_jax as rm
-from raymanifold_jax.trace import first_hit, look_at_patch, march, transmittance, visible
+from raymanifold_jax.trace import Patch, first_hit, look_at_patch, march, transmittance, visible
 from raymanifold_jax.unfolding import in_blocks
 
 N = 16
@@ -234,16 +234,15 @@ def test_convex_solids_do_not_hide_what_is_before_them():
     one, other = one[ahead & (solid[one] != solid[other])], other[ahead & (solid[one] != solid[other])]
     assert len(one) > 2000
     radius = np.full(len(one), 1e-3)
-    rest = lambda *ends: [
-        np.asarray(a) for a in in_blocks(look_at_patch, scene, (points[one] / VOXEL, points[other] / VOXEL, radius, *ends))
-    ]
+    line = points[one] / VOXEL, points[other] / VOXEL
+    rest = lambda *ends: jax.tree.map(np.asarray, in_blocks(look_at_patch, scene, (*line, Patch(radius, *ends))))
     nobody = np.full(len(one), -1)
     with_all, without = rest(nobody, nobody), rest(solid[other], solid[one])
-    assert 0.1 < without[1].mean() < 0.9
-    done = with_all[-1] == 0
+    assert 0.1 < without.blocked.mean() < 0.9
+    done = with_all.effort == 0
     assert done.mean() > 0.9
-    assert np.mean(with_all[1][done] != without[1][done]) < 2e-3
-    assert without[-1].sum() < with_all[-1].sum()  # and there is less left to do
+    assert np.mean(with_all.blocked[done] != without.blocked[done]) < 2e-3
+    assert without.effort.sum() < with_all.effort.sum()  # and there is less left to do
 
 
 def test_a_plane_sees_along_itself():

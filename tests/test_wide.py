@@ -87,6 +87,7 @@ def test_wide_sweeps_give_the_same(name: str, monkeypatch: pytest.MonkeyPatch):
         np.testing.assert_allclose(found, right, rtol=1e-11, atol=1e-12 * np.abs(right).max())
 
 
+@pytest.mark.slow
 def test_wide_sweeps_are_differentiated_in_the_extinction(monkeypatch: pytest.MonkeyPatch):
     scene = _box(rm.Medium(scattering=_uneven((9, 9, 9), 4.0), absorption=0.3), _ROOM)
     scattering = materials(scene, prepare(scene).surfaces).extinction
