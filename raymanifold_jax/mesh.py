@@ -28,7 +28,7 @@ from jaxtyping import Bool, Float, Int
 
 from . import checks
 from .mesh_distance import SampledDistance, sample_distance
-from .shapes import Bounds, Shape, safe_norm
+from .shapes import Bounds, Shape, clamped, greatest, safe_norm
 
 _MARGIN = 4  # cells around the mesh
 _MOST_NODES = 1 << 28
@@ -201,11 +201,11 @@ class Mesh(Shape):
         origin, cell = (jnp.asarray(a, points.dtype) for a in (self.origin, self.cell))
         nodes = (points - origin) / cell
         last = jnp.asarray(self.coefficients.shape, points.dtype) - 2
-        inner = jnp.clip(nodes, 1, last)
+        inner = clamped(nodes, jnp.ones_like(last), last)
         # Off the grid: the solid is at least so far from the grid's sides, and what the nearest side says less the way there.
         away = safe_norm(nodes - inner)
         at_side = _interpolate(self.coefficients, inner)
-        apart = jnp.maximum(away + (_MARGIN - 1), at_side - away)
+        apart = greatest((away + (_MARGIN - 1), at_side - away))
         return cell * jnp.where(away > 0, apart, at_side)
 
     @property

@@ -14,7 +14,8 @@ computes in the dtype of its points, and has a finite gradient everywhere (of le
 is unique and shorter, down to 0, where it is not: at a sphere's centre, on an edge).
 
 Public names: `Shape`, `Sphere`, `Box`, `Torus`, `Cylinder`, `HalfSpace`, `Union`, `Intersection`, `Difference`,
-`Translated`, `Rotated`; `safe_norm`, `corner_distance`, `dot`, `least`, `greatest` for this package.
+`Translated`, `Rotated`; for this package `safe_norm`, `corner_distance`, `dot`, `least`, `greatest`, `greatest_coordinate`,
+`clamped`.
 """
 
 import abc
@@ -69,6 +70,24 @@ def _(primals, tangents):
 def greatest(values: tuple[Float[jax.Array, "*batch"], ...]) -> Float[jax.Array, "*batch"]:
     """The greatest of some arrays; its gradient is the mean of theirs that are greatest."""
     return -least(tuple(-value for value in values))
+
+
+@jax.custom_jvp
+def greatest_coordinate(vectors: Float[jax.Array, "*batch n"]) -> Float[jax.Array, "*batch"]:
+    """The greatest number along the last axis; its gradient is as that of `greatest`, and not JAX's, which is infinite where
+    XLA rounds a repeated value another way."""
+    return jnp.max(vectors, axis=-1)
+
+
+@greatest_coordinate.defjvp
+def _(primals, tangents):
+    (values,), (rates,) = (tuple(map(tuple, (jnp.moveaxis(a, -1, 0) for a in each))) for each in (primals, tangents))
+    return jax.jvp(greatest, (values,), (rates,))
+
+
+def clamped(value: jax.Array, low: Any, high: Any) -> jax.Array:
+    """As `jnp.clip`, whose gradient may be 0 where XLA rounds a repeated value another way."""
+    return jnp.where(value < low, low, jnp.where(value > high, high, value))
 
 
 def safe_norm(vectors: Float[jax.Array, "*batch n"]) -> Float[jax.Array, "*batch"]:
@@ -396,6 +415,6 @@ def _across(axis: Any) -> np.ndarray:
 
 def corner_distance(excess: jax.Array) -> jax.Array:
     # Distance to a convex corner of planes, from how far the point is beyond each plane.
-    inside = jnp.max(excess, axis=-1) if excess.size < _MANY else greatest(tuple(jnp.moveaxis(excess, -1, 0)))
+    inside = greatest_coordinate(excess) if excess.size < _MANY else greatest(tuple(jnp.moveaxis(excess, -1, 0)))
     # Not the usual sum of an outside and an inside term: on a face that would halve the gradient.
-    return jnp.where(inside > 0, safe_norm(jnp.maximum(excess, 0)), inside)
+    return jnp.where(inside > 0, safe_norm(jnp.where(excess > 0, excess, 0)), inside)

@@ -23,7 +23,7 @@ from jaxtyping import Bool, Float
 from . import checks
 from .lattice import Lattice
 from .scene import Solid
-from .shapes import Bounds, Shape, corner_distance, safe_norm
+from .shapes import Bounds, Shape, clamped, corner_distance, greatest, greatest_coordinate, least, safe_norm
 
 _MARGIN = 2  # free cubes around the mask
 # In 32 bits, because JAX keeps constants between 32- and 64-bit modes.
@@ -74,7 +74,7 @@ class Voxels(Shape):
         u = (points - lower) / spacing + _MARGIN
         shape = np.array(self.full.shape)
         # Off the mask: the solid lies within its box, one margin further in than the cube asked.
-        inner = jnp.clip(u, 1.0, jnp.asarray(shape - 1, u.dtype))
+        inner = clamped(u, jnp.ones((), u.dtype), jnp.asarray(shape - 1, u.dtype))
         away = safe_norm(u - inner)
         cube = jnp.clip(jnp.floor(inner).astype(int), 1, jnp.asarray(shape - 2))
         strides = np.array([shape[1] * shape[2], shape[2], 1], np.int32)
@@ -84,12 +84,11 @@ class Voxels(Shape):
         # Distance to each of the cubes around.
         beyond = jnp.abs(u[..., None, :] - (cube[..., None, :] + _AROUND + 0.5)) - 0.5
         to_cube = corner_distance(beyond)
-        nearest = jnp.min(jnp.where(is_full != inside[..., None], to_cube, jnp.inf), -1)
+        nearest = -greatest_coordinate(jnp.where(is_full != inside[..., None], -to_cube, -jnp.inf))
         bound = self.clearance.reshape(-1)[(cube * strides).sum(-1)].astype(u.dtype)
-        outside = jnp.minimum(nearest, bound)
-        return spacing * jnp.where(
-            away > 0, jnp.maximum(away + (_MARGIN - 1), bound - away), jnp.where(inside, -outside, outside)
-        )
+        outside = least((nearest, bound))
+        apart = greatest((away + (_MARGIN - 1), bound - away))
+        return spacing * jnp.where(away > 0, apart, jnp.where(inside, -outside, outside))
 
     def bounds(self) -> Bounds:
         index = np.argwhere(np.asarray(self.full)) - _MARGIN

@@ -5,10 +5,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-# Most of the tests' time goes into compiling programs that run once: without LLVM's optimisation it takes half as long, and
-# rounding is as strict. `XLA_FLAGS= pytest` runs programs as users do. Before JAX reads it; processes of tests inherit it.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
-
 import jax
 import pytest
 
@@ -21,6 +17,10 @@ _MANY = 30_000  # of the 65 530 regions of memory that Linux grants a process
 def pytest_configure(config: pytest.Config) -> None:
     if DEVICES:
         jax.config.update("jax_num_cpu_devices", int(DEVICES))
+    # Most of what tests that are not slow take is compiling programs that run once: not optimised, that takes half as long,
+    # and rounding is as strict. `XLA_FLAGS= pytest` runs programs as users do.
+    if config.option.markexpr == "not slow":
+        os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
     # Environment variables, because pytest-xdist's workers and the command line's subprocesses inherit them. The cache
     # lies in pytest's own (`pytest --cache-clear` empties it) and outlives the run.
     cache = getattr(config, "cache", None)  # none with `-p no:cacheprovider`

@@ -295,7 +295,7 @@ def test_solutions_and_gradients_of_the_papers_scheme_do_not_depend_on_the_mesh(
     close(run(rm.pe_array(4, 2)), run(None), 1e-8)
 
 
-@pytest.mark.parametrize("scheme", [rm.LightRayCube(2), rm.Characteristic()])
+@pytest.mark.parametrize("scheme", [pytest.param(rm.LightRayCube(2), marks=pytest.mark.slow), rm.Characteristic()])
 def test_predicted_messages_are_those_of_the_compiled_program(scheme):
     """Bytes that a device sends for one hop of a direction, from the shapes of the compiled program's permutes."""
     of = scene("open", (12, 12, 12))

@@ -189,7 +189,7 @@ def test_bad_bounces():
         rm.solve(scene, bounces=1.5)
 
 
-@pytest.mark.parametrize("fog", [False, True])
+@pytest.mark.parametrize("fog", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_resolve_goes_on_from_the_light_that_was_found(fog):
     """Within the sum of both bounds of a solve from nothing, in fewer sweeps in all, and never in more."""
     wall = lambda albedo: rm.Wall(albedo)
