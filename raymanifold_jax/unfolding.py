@@ -161,9 +161,10 @@ def in_blocks(function: Callable, scene: Any, arrays: tuple[Any, ...]) -> Any:
     return parts[0] if count == block else _joined(parts, count)
 
 
-def _real(arrays: Any, xp: Any) -> Any:
+def _real(arrays: tuple[Any, ...], xp: Any) -> tuple[Any, ...]:
     real = lambda a: a if a.dtype in (bool, real_dtype()) else a.astype(real_dtype())
-    return jax.tree.map(lambda a: real(xp.asarray(a)), arrays, is_leaf=lambda a: isinstance(a, list))
+    numbers = lambda a: isinstance(a, list) or (isinstance(a, tuple) and not hasattr(a, "_fields"))  # as Python has them
+    return tuple(jax.tree.map(lambda a: real(xp.asarray(a)), array, is_leaf=numbers) for array in arrays)
 
 
 def _power_of_two(count: int) -> int:
