@@ -201,7 +201,7 @@ class Mesh(Shape):
         origin, cell = (jnp.asarray(a, points.dtype) for a in (self.origin, self.cell))
         nodes = (points - origin) / cell
         last = jnp.asarray(self.coefficients.shape, points.dtype) - 2
-        inner = clamped(nodes, jnp.ones_like(last), last)
+        inner = clamped(nodes, 1.0, last)
         # Off the grid: the solid is at least so far from the grid's sides, and what the nearest side says less the way there.
         away = safe_norm(nodes - inner)
         at_side = _interpolate(self.coefficients, inner)

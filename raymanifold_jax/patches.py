@@ -154,12 +154,11 @@ def _patches(scene: Scene, faces: EmittingFaces, side: int) -> _Patches:
     moments = np.einsum("nki,nkj->nij", two, two) * (size**2 / 12) + faces.position[:, :, None] * faces.position[:, None]
     none = np.zeros(len(faces.area), int)
     flat = np.zeros(len(faces.area))
-    smallest = _Patches(
+    steps = [_Patches(
         size=np.full(len(flat), size), radius=np.full(len(flat), size / np.sqrt(2)), center=faces.position, normal=faces.normal,
         arms=_arms(faces.position, faces.normal, moments), area=faces.area, turn=flat, owner=faces.owner,
         target=faces.position, first=none, count=none, topmost=none > 0,
-    )  # fmt: skip
-    steps = [smallest]
+    )]  # fmt: skip
     code, begin = (np.round(2 * faces.normal).astype(int) + 2) @ np.array([25, 5, 1]), 0
     while size < 2 * max(scene.lattice.shape) and len(steps[-1].area) > 1:
         size *= 2

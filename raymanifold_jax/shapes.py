@@ -81,7 +81,7 @@ def greatest_coordinate(vectors: Float[jax.Array, "*batch n"]) -> Float[jax.Arra
 
 @greatest_coordinate.defjvp
 def _(primals, tangents):
-    (values,), (rates,) = (tuple(map(tuple, (jnp.moveaxis(a, -1, 0) for a in each))) for each in (primals, tangents))
+    values, rates = (tuple(jnp.moveaxis(array, -1, 0)) for (array,) in (primals, tangents))
     return jax.jvp(greatest, (values,), (rates,))
 
 

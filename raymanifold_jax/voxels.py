@@ -74,7 +74,7 @@ class Voxels(Shape):
         u = (points - lower) / spacing + _MARGIN
         shape = np.array(self.full.shape)
         # Off the mask: the solid lies within its box, one margin further in than the cube asked.
-        inner = clamped(u, jnp.ones((), u.dtype), jnp.asarray(shape - 1, u.dtype))
+        inner = clamped(u, 1.0, jnp.asarray(shape - 1, u.dtype))
         away = safe_norm(u - inner)
         cube = jnp.clip(jnp.floor(inner).astype(int), 1, jnp.asarray(shape - 2))
         strides = np.array([shape[1] * shape[2], shape[2], 1], np.int32)
