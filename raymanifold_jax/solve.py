@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 
 from . import checks
 from .acceleration import make_diffusion
-from .arrays import as_jax, numpy_or_jax, real_dtype, stop_gradient, worked_out_now, zeros_like
+from .arrays import as_jax, numpy_or_jax, on_accelerator, real_dtype, stop_gradient, worked_out_now, zeros_like
 from .checkpoint import Checkpoint
 from .direct import first_flight, sky_radiance
 from .implicit import Unwatched, attach
@@ -42,6 +42,7 @@ from .solution import Energy, Solution, _Hidden
 from .solvers import Anderson, Jacobi, Krylov, Orders, automatic, worth_diffusing
 from .source_checks import check_sources
 from .surfaces import Surfaces
+from .transport import native
 from .transport.characteristic import Characteristic
 from .transport.light_ray_cube import LightRayCube
 from .transport.ray_cube_system import CubeSystem, make_cube_system
@@ -107,6 +108,8 @@ def solve(
     if prepared is None:
         let_go()
     check_memory(scene.lattice.shape, scene.bands, len(quadrature), scene.medium is not None)
+    if mesh is None and cube is None and not on_accelerator():
+        native.compile_aside(real_dtype(), scene.medium is not None)
     meter = make_progress(progress)
     with meter:
         meter.start(f"solve {scene.summary()}")

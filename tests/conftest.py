@@ -35,6 +35,11 @@ def pytest_configure(config: pytest.Config) -> None:
     )
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """First those that compile loops for 64-bit numbers, while another worker waits for those of 32."""
+    items.sort(key=lambda item: item.path.stem != "test_native")
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
     """Whole files go to a worker: their tests share compiled programs. In their order, as those of few tests may be long."""

@@ -21,7 +21,7 @@ import raymanifold_jax as rm
 from raymanifold_jax.layout import make_ordinates
 from raymanifold_jax.operator import Transport, _slopes, make_transport, materials
 from raymanifold_jax.prepare import prepare
-from raymanifold_jax.transport import derivative, native
+from raymanifold_jax.transport import derivative, machine_code, native
 from raymanifold_jax.transport.characteristic import Inflow
 from raymanifold_jax.transport.links import find_links
 from raymanifold_jax.transport.machine_code import kept
@@ -285,6 +285,35 @@ def test_processes_compile_one_at_a_time(folder):
         waited = waiting.is_alive()
     waiting.join()
     assert waited and file.exists()
+
+
+def test_loops_take_what_they_are_said_to_take():
+    for medium in (rm.Medium(2.0, 0.1), None):
+        rm.solve(_box(medium, _ROOM, (3, 3, 3)), rm.quadrature.fibonacci(12), progress=False)
+    for loop in (getattr(machine_code, name) for name in machine_code.__all__):
+        if isinstance(loop, kept.Loop):
+            examples = [loop.examples(np.dtype(real)) for real in (np.float32, np.float64)]
+            said = {tuple(kept._take_apart(argument, []) for argument in each) for each in examples}
+            assert loop._ready and set(loop._ready) <= said, loop.name
+
+
+def test_loops_are_compiled_by_processes_of_their_own(monkeypatch, folder):
+    commands = []
+    monkeypatch.setattr(kept.subprocess, "Popen", lambda command, **_: commands.append(command))
+    monkeypatch.setattr(kept, "count_cores", lambda: 2)
+    loops = machine_code.tally, machine_code.follow
+    kept.compile_aside(np.dtype(float), loops, ())
+    kept._have("<f8", ["tally"])
+    assert {file.name for file in folder.glob("*.loop")} == {machine_code.tally.file(*[np.zeros(1, np.int32)] * 2).name}
+    kept.compile_aside(np.dtype(float), loops)  # of which one is there
+    kept._have("<f8", ["follow"])
+    kept.compile_aside(np.dtype(float), loops)  # nothing to do
+    monkeypatch.setattr(kept, "count_cores", lambda: 1)
+    kept.compile_aside(np.dtype(np.float32), loops)
+    assert len(commands) == 2
+    monkeypatch.undo()
+    done = subprocess.run(commands[0], capture_output=True, text=True, timeout=300)  # beside the sources, as these are kept
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_a_numba_that_does_not_import_is_told_and_left_alone(monkeypatch):

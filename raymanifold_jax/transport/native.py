@@ -6,7 +6,7 @@ directions and extinction are. Each core takes some of the directions through al
 This serves known numbers of one device that is a CPU, where numba is installed; all else is left to `characteristic`, which
 gives the same results to rounding.
 
-Public: `installed`, `serves`, `at_hand`, `sweep`, `unsweep`, `views`, `follow`, `retrace`, `hit_bits`.
+Public: `installed`, `compile_aside`, `serves`, `at_hand`, `sweep`, `unsweep`, `views`, `follow`, `retrace`, `hit_bits`.
 """
 
 from __future__ import annotations
@@ -53,6 +53,20 @@ def installed() -> bool:
         warnings.warn(f"numba cannot be used here, so sweeps take longer: {problem}", stacklevel=2)
         return False
     return True
+
+
+@functools.cache
+def compile_aside(real: np.dtype, medium: bool) -> None:
+    """Have what a solve needs compiled by other processes, where it is not kept, while it finds its surfaces."""
+    if not installed():
+        return
+    from . import machine_code as code
+
+    # Those that take long in groups of about the same length; what is needed first, first.
+    if medium:
+        code.compile_aside(real, (code.forwards,), (code.mark, code.pack, code.backwards))
+    else:
+        code.compile_aside(real, (code.mark, code.pack, code.views), (code.sort, code.in_vacuum, code.follow, code.retrace))
 
 
 def serves(layout: Any, ordinates: tuple[Ordinates, ...], arguments: Any) -> bool:
@@ -119,9 +133,10 @@ def sweep(
         planes, cut, *readers = arguments
         if not manner.elements:
             readers = [r._replace(runs=np.zeros_like(r.runs), alone=np.zeros_like(r.alone)) for r in readers]
+        along = lambda a: _planes(np.asarray(slopes[a]), axis) if slopes else np.zeros((1, 1, 1), real)
         light = _contiguous(code.Light(
             source=np.zeros((1, bands, 1), real) if volume is None else _planes(volume, axis),
-            slopes=tuple(_planes(np.asarray(slopes[a]), axis) if slopes else np.zeros((1, 1, 1), real) for a in AXES[axis]),
+            slopes=(along(AXES[axis][0]), along(AXES[axis][1]), along(AXES[axis][2])),
             cut=_gathered(sent, layout, line.at_cut, len(line.cut.cell)),
             ghost=_gathered(sent, layout, line.at_ghost, len(line.ghosts.cell)),
             radiance=np.zeros((0, 1, bands), real) if inflow is None else np.asarray(inflow.radiance),
@@ -351,7 +366,7 @@ def hit_bits(
     found = np.zeros((ordinates.weight.shape[0], -(-ordinates.weight.shape[1] // 32), len(order)), np.uint32)
     # Directions of a chunk share words: each chunk is one core's.
     parts = [np.nonzero(chunk % count_cores() == core)[0] for core in range(count_cores())]
-    for _ in on_cores(lambda part: code.mark(part, *known, _segments(code), found), [p for p in parts if len(p)]):
+    for _ in on_cores(lambda part: code.mark(part, *known, _segments(code.Segments), found), [p for p in parts if len(p)]):
         pass
     bits = np.empty_like(found)
     bits[..., order] = found
@@ -392,9 +407,9 @@ def _at_a_time(code, line: _Axis) -> int:
     return -(-each // code.TOGETHER) * code.TOGETHER
 
 
-def _segments(code, *of: int) -> machine_code.Segments:
+def _segments(kind: Callable[..., T], *of: int) -> T:
     three, points = (*of, 3), (*of, 3, 3)
-    return code.Segments(
+    return kind(
         np.zeros(three), np.zeros(points), np.zeros(points), np.zeros(three, int), np.zeros(three), np.zeros((*of, 4), int)
     )
 
@@ -407,7 +422,7 @@ def _work(code, line: _Axis, directions: int, together: int, real) -> machine_co
         own=np.zeros(directions, int), free=np.zeros((together, 4), int), passing=np.zeros(directions, int),
         count=np.zeros(together, int), length=np.zeros(together), weight=np.zeros(together),
         point=np.zeros(3), whole=np.zeros(3), form=np.zeros((code.ROWS + 1) * code.BLOCK),
-        picked=np.zeros(_most(line), np.uint32), at=np.zeros(code.BLOCK, np.uint32), way=_segments(code, together),
+        picked=np.zeros(_most(line), np.uint32), at=np.zeros(code.BLOCK, np.uint32), way=_segments(code.AllSegments, together),
     )  # fmt: skip
 
 
@@ -417,7 +432,7 @@ def _standing(code, line: _Axis, directions: int, real) -> machine_code.Standing
         rows=np.zeros((directions, line.area), real), shift=np.zeros(directions, int), nowhere=np.zeros(1, real),
         hits=np.zeros((3, most), real), probes=np.zeros((3, most), real), picked=np.zeros((2, most), np.uint32),
         here=_cut_blocks(code, line, real), sent=_of_ghosts(line, 1, real)[0], form=np.zeros((code.ROWS + 1) * code.BLOCK),
-        at=np.zeros(code.BLOCK, np.uint32), way=_segments(code),
+        at=np.zeros(code.BLOCK, np.uint32), way=_segments(code.Segments),
     )  # fmt: skip
 
 

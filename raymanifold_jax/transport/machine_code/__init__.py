@@ -13,8 +13,11 @@ Numbers of whole planes are of the fields' own type; those of elements are worke
 What is exported are the loops' names: numba is imported where one has to be compiled (see `kept`).
 
 Public: `forwards`, `backwards`, `in_vacuum`, `views`, `tally`, `sort`, `follow`, `retrace`, `mark`, `pack`, and the tuples that
-they take; `get_ready`.
+they take; `get_ready`, `compile_aside`.
 """
+
+import numpy as np
+from jaxtyping import Float, Float64, Int32, Int64, UInt8, UInt32
 
 from .arguments import (
     BLOCK,
@@ -24,24 +27,44 @@ from .arguments import (
     ROWS,
     TOGETHER,
     UNEVEN,
+    AllSegments,
     Around,
     Cells,
+    Chosen,
     Elements,
+    Field,
     Light,
     Manner,
     Planes,
     Readers,
     Segments,
     Standing,
+    Sums,
     Ways,
     Work,
 )
-from .kept import Loop, get_ready
+from .kept import Loop, compile_aside, get_ready
 
-forwards, backwards = Loop("evolution", "forwards"), Loop("evolution", "backwards")
-in_vacuum, views = Loop("vacuum", "in_vacuum"), Loop("vacuum", "views")
-tally, sort, follow, retrace = (Loop("vacuum", name) for name in ("tally", "sort", "follow", "retrace"))
-mark, pack = Loop("marks", "mark"), Loop("marks", "pack")
+_LATTICE = Ways, Planes, Cells, Cells, Readers, Readers
+_LIST = Int32[np.ndarray, "n"]
+_WEIGHTS = Float[np.ndarray, "L"]
+_PLACES = Int64[np.ndarray, "N"], Int64[np.ndarray, "N"]  # chunk and place of each direction
+_WORDS = UInt32[np.ndarray, "G words I"]
+_LINKS = int, int, Int32[np.ndarray, "E+1"], _LIST, _WEIGHTS, Float64[np.ndarray, "C n"], Float64[np.ndarray, "C n"]
+
+forwards = Loop("evolution", "forwards", Chosen, *_LATTICE, Light, Manner, Work, Sums, Sums, Field)
+backwards = Loop("evolution", "backwards", Chosen, *_LATTICE, Manner, Work, Sums, Sums, Field, Light)
+in_vacuum = Loop("vacuum", "in_vacuum", Chosen, *_LATTICE, Light, Manner, Standing, Sums, Sums, Field)
+views = Loop(
+    "vacuum", "views", Chosen, *_LATTICE, Manner, Standing, _LIST, _LIST, _LIST, _LIST, _WEIGHTS, carried=np.dtype(np.int32)
+)
+tally, sort = Loop("vacuum", "tally", _LIST, _LIST), Loop("vacuum", "sort", _LIST, _LIST, _WEIGHTS, _LIST, _LIST, _WEIGHTS)
+follow, retrace = Loop("vacuum", "follow", *_LINKS), Loop("vacuum", "retrace", *_LINKS)
+mark = Loop("marks", "mark", Chosen, Ways, Around, Elements, *_PLACES, Segments, _WORDS)
+pack = Loop(
+    "marks", "pack", Chosen, Ways, _WORDS, np.uint32, *_PLACES, UInt32[np.ndarray, "M"], Float[np.ndarray, "4 M"],
+    UInt32[np.ndarray, "M"], UInt8[np.ndarray, "M"], UInt8[np.ndarray, "N M/8"],
+)  # fmt: skip
 
 __all__ = [
     "BLOCK",
@@ -51,6 +74,7 @@ __all__ = [
     "ROWS",
     "TOGETHER",
     "UNEVEN",
+    "AllSegments",
     "Around",
     "Cells",
     "Elements",
@@ -63,6 +87,7 @@ __all__ = [
     "Ways",
     "Work",
     "backwards",
+    "compile_aside",
     "follow",
     "forwards",
     "get_ready",

@@ -10,7 +10,9 @@ their size, a pointer to the first, n lengths and n strides.
 
 As those of programs (`program_files`), the files are code: they lie beside the sources, or in a folder that is the user's own.
 
-Public: `Loop`, `get_ready`.
+What a solve will need can be compiled ahead, by processes of their own: one compiles a single loop at a time.
+
+Public: `Loop`, `get_ready`, `compile_aside`.
 """
 
 from __future__ import annotations
@@ -23,16 +25,20 @@ import importlib
 import os
 import pickle
 import platform
+import subprocess
+import sys
 import threading
 import zlib
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterable, Iterator
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
+from jaxtyping import Float, Shaped
 
 from ...program_files import is_own, user_cache, write_whole
+from ...threads import count_cores
 
 try:
     import fcntl
@@ -45,14 +51,21 @@ _C = {"ptr": ctypes.c_void_p, "i64": ctypes.c_int64, "i32": ctypes.c_uint32, "i8
 _C |= {"double": ctypes.c_double, "float": ctypes.c_float}
 _SCALARS: dict[type, str] = {bool: "i8", int: "i64", float: "double", np.int64: "i64", np.float64: "double", np.uint32: "i32"}
 
+_aside: list[subprocess.Popen] = []  # that compile; kept, because Python warns of those that it forgets
+
 
 class Loop:
     """The function `name` of a module of this folder. Arrays that it takes lie in memory as C has them; it returns a number or
-    nothing, and other threads of Python go on meanwhile."""
+    nothing, and other threads of Python go on meanwhile.
 
-    def __init__(self, module: str, name: str):
+    `takes` are the types of its arguments; `carried` what rays carry (see `arguments`), the fields' own type if None.
+    """
+
+    def __init__(self, module: str, name: str, *takes: Any, carried: np.dtype | None = None):
         self.name = name
         self._module = module
+        self._takes = takes
+        self._carried = carried
         self._ready: dict[Hashable, Callable[[list], int]] = {}
         self._lock = threading.Lock()
 
@@ -70,6 +83,15 @@ class Loop:
         """Where the loop is kept for such arguments."""
         form = tuple(_take_apart(argument, []) for argument in arguments)
         return _folder() / f"{self.name}-{_circumstances()}-{_digest(repr(form))}.loop"
+
+    def examples(self, real: np.dtype) -> tuple:
+        """Arguments of its types for fields of the type `real`, with nothing in them."""
+        return tuple(_example(kind, real, self._carried or real) for kind in self._takes)
+
+    def have(self, real: np.dtype) -> None:
+        """Have it ready, and kept, for such fields."""
+        arguments = self.examples(real)
+        self._find(tuple(_take_apart(argument, []) for argument in arguments), arguments)
 
     def _find(self, form: Hashable, arguments: tuple) -> Callable[[list], int]:
         file = self.file(*arguments)
@@ -97,6 +119,39 @@ def get_ready() -> None:
     importlib.import_module("llvmlite.binding")
     if not any(_folder().glob(f"*-{_circumstances()}-*.loop")):
         Loop("vacuum", "tally")(np.zeros(1, np.int32), np.zeros(1, np.int32))
+
+
+def compile_aside(real: np.dtype, *groups: Iterable[Loop]) -> None:
+    """Have the loops of each group compiled, one after the other, by a process of its own, and go on meanwhile.
+
+    What is needed before it is ready is waited for. None is begun on a single core, nor where nothing can be kept.
+    """
+    if count_cores() < 2 or fcntl is None or not os.access(_folder(), os.W_OK):
+        return
+    quiet = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
+    for group in groups:
+        missing = [loop.name for loop in group if not loop.file(*loop.examples(real)).exists()]
+        code = f"import sys; sys.path[:] = {sys.path}; from {__name__} import _have; _have({real.str!r}, {missing})"
+        if missing:
+            with contextlib.suppress(OSError):
+                _aside.append(subprocess.Popen([sys.executable, "-c", code], **quiet))
+
+
+def _have(real: str, names: list[str]) -> None:
+    loops = sys.modules[__name__.rpartition(".")[0]]
+    for name in names:
+        getattr(loops, name).have(np.dtype(real))
+
+
+def _example(kind: Any, real: np.dtype, carried: np.dtype) -> Any:
+    if get_origin(kind) is tuple:
+        return tuple(_example(part, real, carried) for part in get_args(kind))
+    if hasattr(kind, "_fields"):
+        return kind(*(_example(part, real, carried) for part in get_type_hints(kind).values()))
+    if hasattr(kind, "dims"):  # jaxtyping's
+        generic = {str(Float.dtypes): real, str(Shaped.dtypes): carried}  # pyright: ignore[reportAttributeAccessIssue]
+        return np.zeros((0,) * len(kind.dims), dtype=generic.get(str(kind.dtypes)) or kind.dtypes[0])
+    return kind(0)
 
 
 def _take_apart(value: Any, numbers: list[Any]) -> Any:
