@@ -24,50 +24,56 @@ from .operator import Light
 from .programs import program
 
 _INDEPENDENT = 1e-6  # of the first residual: less than this of a new direction is rounding
+_QUICK = 4  # steps after which it is time to begin anew if each has at least halved the residual
 
 
 class Subspace:
     """What GMRES knows after some steps from a residual `start`.
 
     `apply(z)` returns (what to keep of z, K z). `residual` is what is left of `start`; `gain()` the same combination of what
-    was kept as x is of the z; `exhausted`: no further step can help.
+    was kept as x is of the z; `exhausted`: time to begin anew from there. That is after `size` steps, where no step can help, and,
+    to keep less, where the residual falls quickly anyway.
     """
 
     def __init__(self, apply: Callable[[Light], tuple[Light, Light]], start: Light, size: int, precondition: Callable):
-        self._apply, self._precondition = apply, precondition
+        self._apply, self._precondition, self._size = apply, precondition, size
         self._length = float(norm(start))
-        empty = zeros_like(start)
-        self._basis = [combine([1 / self._length], [start])] + [empty] * size
+        self._basis = [combine([1 / self._length], [start])]
         self._kept: list[Light] = []
-        self._steps = 0
         self._hessenberg = np.zeros((size + 1, size))
         self._weights = np.zeros(0)
         self.residual, self.exhausted = start, False
 
     def step(self) -> None:
-        k, size = self._steps, len(self._basis) - 1
+        k = len(self._kept)
         sent = self._precondition(self._basis[k])
         kept, passed = self._apply(sent)
-        if not self._kept:  # always as many, so that one program adds them up
-            self._kept = [zeros_like(kept)] * size
-        self._kept[k] = kept
-        self._steps += 1
-        self._basis[k + 1], column = _arnoldi(tuple(self._basis), sent, passed)
+        self._kept.append(kept)
+        vector, column = _arnoldi(self._as_many(self._basis), np.int32(k + 1), sent, passed)
+        self._basis.append(vector)
         hessenberg, column = self._hessenberg, np.asarray(column, np.float64)
-        hessenberg[:, k] = column[: len(hessenberg)]
-        hessenberg[k + 1, k] = column[-1]
+        hessenberg[: k + 1, k], hessenberg[k + 1, k] = column[: k + 1], column[-1]
         small = hessenberg[: k + 2, : k + 1]
         right = np.zeros(k + 2)
         right[0] = self._length
-        weights = np.linalg.lstsq(small, right, rcond=None)[0]
-        left = np.zeros(size + 1)
-        left[: k + 2] = right - small @ weights
-        self._weights = np.append(weights, np.zeros(size - k - 1))
-        self.residual = combine(left, self._basis)
-        self.exhausted = k + 1 == size or hessenberg[k + 1, k] <= _INDEPENDENT * abs(hessenberg[: k + 1, k]).max()
+        self._weights = np.linalg.lstsq(small, right, rcond=None)[0]
+        left = right - small @ self._weights
+        self.residual = self._combined(left, self._basis)
+        quick = k + 1 >= _QUICK and np.linalg.norm(left) <= 0.5 ** (k + 1) * self._length
+        alike = hessenberg[k + 1, k] <= _INDEPENDENT * abs(hessenberg[: k + 1, k]).max()
+        self.exhausted = quick or k + 1 == self._size or bool(alike)
 
     def gain(self) -> Light:
-        return combine(self._weights, self._kept)
+        return self._combined(self._weights, self._kept)
+
+    def _combined(self, weights: np.ndarray, fields: list[Light]) -> Light:
+        fields = self._as_many(fields)
+        return combine([*weights, *np.zeros(len(fields) - len(weights))], fields)
+
+    def _as_many(self, fields: list[Light]) -> list[Light]:
+        """With the first once more, and again, so that two programs serve any number."""
+        many = _QUICK + 1 if len(fields) <= _QUICK + 1 else self._size + 1
+        return [*fields, *fields[:1] * (many - len(fields))]
 
 
 def linear_solve(
@@ -98,12 +104,12 @@ def linear_solve(
 
 
 @program
-def _arnoldi(basis: tuple[Light, ...], sent: Light, passed: Light) -> tuple[Light, Array]:
-    """The next basis vector: (I - K) sent, made orthogonal to the basis; `passed` is K sent. Unused vectors are 0."""
+def _arnoldi(basis: list[Light], count: Array, sent: Light, passed: Light) -> tuple[Light, Array]:
+    """The next basis vector: (I - K) sent, made orthogonal to the first `count` of the basis; `passed` is K sent."""
     vector = jax.tree.map(jnp.subtract, sent, passed)
     column = jnp.zeros(len(basis), sent.elements.dtype)
     for _ in range(2):  # twice is enough, in float32 too
-        overlap = jnp.stack([dot(b, vector) for b in basis])
+        overlap = jnp.where(jnp.arange(len(basis)) < count, jnp.stack([dot(b, vector) for b in basis]), 0.0)
         for k, b in enumerate(basis):
             vector = jax.tree.map(lambda v, x, k=k, overlap=overlap: v - overlap[k] * x, vector, b)
         column = column + overlap

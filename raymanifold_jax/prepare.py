@@ -21,11 +21,13 @@ from jax.sharding import Mesh
 from . import checks
 from .arrays import worked_out_now
 from .layout import Layout, make_layout
+from .memory import give_back_freed
 from .partition import Partition, make_partition
 from .placement import known
 from .scene import Scene
 from .surfaces import Surfaces, find_surfaces
 
+_FIELD = 4  # bytes a voxel of the fields that are made on the way
 _SMALL = 1 << 20  # voxels times bands, of which a solve keeps what it has made
 
 _lock = threading.Lock()
@@ -111,4 +113,7 @@ def prepare(scene: Scene) -> Prepared:
     # Known even while JAX traces values.
     with worked_out_now():
         surfaces = find_surfaces(scene)
-        return Prepared(surfaces, make_layout(scene, surfaces))
+        give_back_freed(_FIELD * surfaces.solid.size)
+        prepared = Prepared(surfaces, make_layout(scene, surfaces))
+        give_back_freed(_FIELD * surfaces.solid.size)
+        return prepared

@@ -68,7 +68,8 @@ def _add(total: Light, lost: Light, order: Light) -> tuple[Light, Light]:
 
 
 class Krylov(eqx.Module):
-    """GMRES on (I - K) x = b, restarted after `restart` sweeps; 2 `restart` + 1 fields more.
+    """GMRES on (I - K) x = b, restarted after `restart` sweeps, or sooner where each halves the residual; 9 fields more, at most
+    2 `restart` + 1.
 
     With `diffusion`, preconditioned by it (`acceleration`): nearly the same number of sweeps at any albedo and optical depth.
     """
@@ -80,16 +81,20 @@ class Krylov(eqx.Module):
         checks.positive_int("restart", self.restart)
 
     def run(self, iteration: Iteration) -> None:
-        precondition = iteration.system.precondition if self.diffusion else lambda light: light
         while not iteration.over:
-            begun = iteration.arriving
-            space = Subspace(iteration.system.bounce, iteration.residual, self.restart, precondition)
-            while not (iteration.over or space.exhausted):
-                space.step()
-                iteration.reach(begun + space.gain(), space.residual)
-                if iteration.close:
-                    iteration.polish()
+            self._go_on(iteration)
             iteration.keep()
+
+    def _go_on(self, iteration: Iteration) -> None:
+        """Until it is over, or time to begin anew: what was kept till then is given up at the end."""
+        precondition = iteration.system.precondition if self.diffusion else lambda light: light
+        begun = iteration.arriving
+        space = Subspace(iteration.system.bounce, iteration.residual, self.restart, precondition)
+        while not (iteration.over or space.exhausted):
+            space.step()
+            iteration.reach(begun + space.gain(), space.residual)
+            if iteration.close:
+                iteration.polish()
 
 
 class Anderson(eqx.Module):

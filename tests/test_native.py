@@ -298,8 +298,8 @@ def test_loops_take_what_they_are_said_to_take():
 
 
 def test_loops_are_compiled_by_processes_of_their_own(monkeypatch, folder):
-    commands = []
-    monkeypatch.setattr(kept.subprocess, "Popen", lambda command, **_: commands.append(command))
+    commands, process = [], subprocess.Popen([sys.executable, "-c", ""])
+    monkeypatch.setattr(kept.subprocess, "Popen", lambda command, **_: commands.append(command) or process)
     monkeypatch.setattr(kept, "count_cores", lambda: 2)
     loops = machine_code.tally, machine_code.follow
     kept.compile_aside(np.dtype(float), loops, ())

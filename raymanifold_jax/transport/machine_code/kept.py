@@ -51,8 +51,6 @@ _C = {"ptr": ctypes.c_void_p, "i64": ctypes.c_int64, "i32": ctypes.c_uint32, "i8
 _C |= {"double": ctypes.c_double, "float": ctypes.c_float}
 _SCALARS: dict[type, str] = {bool: "i8", int: "i64", float: "double", np.int64: "i64", np.float64: "double", np.uint32: "i32"}
 
-_aside: list[subprocess.Popen] = []  # that compile; kept, because Python warns of those that it forgets
-
 
 class Loop:
     """The function `name` of a module of this folder. Arrays that it takes lie in memory as C has them; it returns a number or
@@ -126,7 +124,7 @@ def compile_aside(real: np.dtype, *groups: Iterable[Loop]) -> None:
 
     What is needed before it is ready is waited for. None is begun on a single core, nor where nothing can be kept.
     """
-    if count_cores() < 2 or fcntl is None or not os.access(_folder(), os.W_OK):
+    if count_cores() < 2 or fcntl is None or not (sys.executable and os.access(_folder(), os.W_OK)):
         return
     quiet = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
     for group in groups:
@@ -134,7 +132,8 @@ def compile_aside(real: np.dtype, *groups: Iterable[Loop]) -> None:
         code = f"import sys; sys.path[:] = {sys.path}; from {__name__} import _have; _have({real.str!r}, {missing})"
         if missing:
             with contextlib.suppress(OSError):
-                _aside.append(subprocess.Popen([sys.executable, "-c", code], **quiet))
+                process = subprocess.Popen([sys.executable, "-c", code], **quiet)
+                threading.Thread(target=process.wait, daemon=True).start()  # so that nothing is left of it in the end
 
 
 def _have(real: str, names: list[str]) -> None:
