@@ -24,7 +24,7 @@ from .operator import Light
 from .programs import program
 
 _INDEPENDENT = 1e-6  # of the first residual: less than this of a new direction is rounding
-_QUICK = 4  # steps after which it is time to begin anew if each has at least halved the residual
+_QUICK = 4  # steps after which it is time to begin anew, with a medium, if each has at least halved the residual
 
 
 class Subspace:
@@ -32,7 +32,7 @@ class Subspace:
 
     `apply(z)` returns (what to keep of z, K z). `residual` is what is left of `start`; `gain()` the same combination of what
     was kept as x is of the z; `exhausted`: time to begin anew from there. That is after `size` steps, where no step can help, and,
-    to keep less, where the residual falls quickly anyway.
+    to keep fewer fields of voxels, where the residual falls quickly anyway.
     """
 
     def __init__(self, apply: Callable[[Light], tuple[Light, Light]], start: Light, size: int, precondition: Callable):
@@ -59,7 +59,7 @@ class Subspace:
         self._weights = np.linalg.lstsq(small, right, rcond=None)[0]
         left = right - small @ self._weights
         self.residual = self._combined(left, self._basis)
-        quick = k + 1 >= _QUICK and np.linalg.norm(left) <= 0.5 ** (k + 1) * self._length
+        quick = passed.voxels is not None and k + 1 >= _QUICK and np.linalg.norm(left) <= 0.5 ** (k + 1) * self._length
         alike = hessenberg[k + 1, k] <= _INDEPENDENT * abs(hessenberg[: k + 1, k]).max()
         self.exhausted = quick or k + 1 == self._size or bool(alike)
 

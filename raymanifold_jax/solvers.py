@@ -68,8 +68,9 @@ def _add(total: Light, lost: Light, order: Light) -> tuple[Light, Light]:
 
 
 class Krylov(eqx.Module):
-    """GMRES on (I - K) x = b, restarted after `restart` sweeps, or sooner where each halves the residual; 9 fields more, at most
-    2 `restart` + 1.
+    """GMRES on (I - K) x = b, restarted after `restart` sweeps; 2 `restart` + 1 fields more.
+
+    With a medium it begins anew after four sweeps if each has halved the residual: that takes no more sweeps, and 9 fields.
 
     With `diffusion`, preconditioned by it (`acceleration`): nearly the same number of sweeps at any albedo and optical depth.
     """
