@@ -31,8 +31,8 @@ class Subspace:
     """What GMRES knows after some steps from a residual `start`.
 
     `apply(z)` returns (what to keep of z, K z). `residual` is what is left of `start`; `gain()` the same combination of what
-    was kept as x is of the z; `exhausted`: time to begin anew from there. That is after `size` steps, where no step can help, and,
-    to keep fewer fields of voxels, where the residual falls quickly anyway.
+    was kept as x is of the z; `exhausted`: time to begin anew from there. That is after `size` steps, where no step can help,
+    and, to keep fewer fields of voxels, where the residual falls quickly anyway.
     """
 
     def __init__(self, apply: Callable[[Light], tuple[Light, Light]], start: Light, size: int, precondition: Callable):

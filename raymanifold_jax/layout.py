@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from .arrays import as_jax, numpy_or_jax_of, on_accelerator, real_dtype
+from .programs import program
 from .quadrature import Quadrature
 from .scene import MIRROR, Scene
 from .surfaces import Surfaces
@@ -99,14 +100,36 @@ class Layout(eqx.Module):
     pad: tuple[int, int, int] = eqx.field(static=True)
     spacing: float = eqx.field(static=True)
     elements: int = eqx.field(static=True)
-    plane: Float[Array, "4 X Y Z"]  # offset and normal of each voxel's surface; free: 1, 0; ghosts: -1, 0
+    cut_cell: Int[Array, " J"]  # voxels that hold a surface, flat in the padded lattice
+    cut_plane: Float[Array, "4 J"]  # and the offset and normal that stand for it
     cell: Int[Array, " I"]  # voxel of each element image, flat in the padded lattice
     face: Float[Array, "4 I"]  # and its plane: offset and normal
     source_element: Int[Array, " I"]
     share: Float[Array, " I"]  # its share of that voxel's exitance
     buried: Bool[Array, "X Y Z"]  # voxels wholly inside solids
-    inflow_image: Int[Array, "X Y Z"]  # which mirror image an open ghost voxel belongs to; -1: not open
+    open_cell: Int[Array, " O"]  # ghost voxels that are open, flat
+    open_image: Int[Array, " O"]  # and which mirror image they belong to
     reads: tuple[AxisReads, ...]  # by sweep axis
+
+    @property
+    def plane(self) -> Float[Array, "4 X Y Z"]:
+        """Offset and normal of each voxel's surface; free: 1, 0; ghosts: -1, 0."""
+        return _spread_out(self.cut_cell, self.cut_plane, (1.0, 0.0, 0.0, 0.0), (-1.0, 0.0, 0.0, 0.0), self.padded, self.pad)
+
+    @property
+    def free(self) -> Bool[Array, "X Y Z"]:
+        """Voxels without surfaces."""
+        return _spread_out(self.cut_cell, self.cut_plane[:1], (1.0,), (-1.0,), self.padded, self.pad)[0] == 1.0
+
+    @property
+    def inflow_image(self) -> Int[Array, "X Y Z"]:
+        """Which mirror image an open ghost voxel belongs to; -1: not open."""
+        return _spread_out(self.open_cell, self.open_image[None], (-1,), (-1,), self.padded, self.pad)[0]
+
+    @property
+    def real(self) -> np.dtype:
+        """Of its numbers."""
+        return np.dtype(self.cut_plane.dtype)
 
     @property
     def wide(self) -> bool:
@@ -165,6 +188,15 @@ class Layout(eqx.Module):
         return exitance_in_voxels(exitance, self.source_element, self.share, self.cell, self.padded)
 
 
+@program
+def _spread_out(cell: Int[Array, " J"], values: Array, inside: tuple, rim: tuple, padded: tuple, pad: tuple) -> Array:
+    """Few voxels' values [K, J] on the padded lattice, where all others inside have the same, and all at the rim."""
+    widths = [(p, p) for p in pad]
+    shape = tuple(n - 2 * p for n, p in zip(padded, pad, strict=True))
+    fields = [jnp.pad(jnp.full(shape, i, values.dtype), widths, constant_values=r) for i, r in zip(inside, rim, strict=True)]
+    return jnp.stack(fields).reshape(len(fields), -1).at[:, cell].set(values).reshape(-1, *padded)
+
+
 def flat_planes(field: Float[Array, "*C X Y Z"], axis: int) -> Float[Array, "K *C P"]:
     """A field as flat planes along a sweep axis."""
     bands = field.ndim - 3
@@ -207,17 +239,16 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
     image_number = np.repeat(np.arange(len(images)), len(surfaces))
     offset = surfaces.offset[element]
     flat = np.asarray(np.ravel_multi_index(tuple(voxel.T), padded)) if len(voxel) else np.zeros(0, int)
-    size = int(np.prod(padded))
 
     area = surfaces.area[element]
-    total = np.bincount(flat, area, size)
     ghost = np.ones(padded, bool)
-    inner = tuple(slice(p, n - p) for p, n in zip(pad, padded, strict=True))
-    ghost[inner] = False
-    plane = _voxel_planes(flat, offset, normal, area, total, padded, ghost)
-    inflow = np.full(size, -1)
+    ghost[tuple(slice(p, n - p) for p, n in zip(pad, padded, strict=True))] = False
+    cells, place = np.unique(flat, return_inverse=True)
+    weight = area / np.maximum(np.bincount(place, area, len(cells)), 1e-300)[place]
+    inside = ~ghost.ravel()[cells]
+    plane = _voxel_planes(place, len(cells), offset, normal, weight)[:, inside]
     is_open = surfaces.open[element]
-    inflow[flat[is_open]] = image_number[is_open]
+    open_cell, first = np.unique(flat[is_open], return_index=True)
     blocked = np.pad(
         unfolding.unfold(surfaces.solid[None])[0],
         [(p, p) for p in pad],
@@ -237,13 +268,15 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
         pad=pad,
         spacing=lattice.spacing,
         elements=len(surfaces),
-        plane=as_jax(plane, real),
+        cut_cell=as_jax(cells[inside], np.int32),
+        cut_plane=as_jax(plane, real),
         cell=as_jax(flat, np.int32),
         face=as_jax(np.column_stack([offset, normal]).T, real),
         source_element=as_jax(element, np.int32),
-        share=as_jax(area / np.maximum(total[flat], 1e-300), real),
+        share=as_jax(weight, real),
         buried=as_jax(blocked & ~ghost),
-        inflow_image=as_jax(inflow.reshape(padded), np.int32),
+        open_cell=as_jax(open_cell, np.int32),
+        open_image=as_jax(image_number[is_open][first], np.int32),
         reads=_all_reads(padded, [(rows, voxel), (probes, probe[probing])], real),
     )
 
@@ -269,23 +302,16 @@ def _image(unfolding, number, signs, shape, pad, surfaces: Surfaces) -> dict[str
     }
 
 
-def _voxel_planes(flat, offset, normal, area, total, padded, ghost) -> np.ndarray:
-    """The one plane that stands for a voxel's elements in the sweep: (4, X, Y, Z)."""
-    size = int(np.prod(padded))
-    plane = np.zeros((4, size))
-    weight = area / np.maximum(total[flat], 1e-300)
-    for row, values in enumerate((offset, *normal.T)):
-        plane[row] = np.bincount(flat, weight * values, size)
+def _voxel_planes(place: np.ndarray, count: int, offset: np.ndarray, normal: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """The one plane that stands for the elements of each voxel in the sweep, (4, J); `place` says which voxel is whose."""
+    plane = np.array([np.bincount(place, weight * values, count) for values in (offset, *normal.T)], float)
     length = np.linalg.norm(plane[1:], axis=0)
     plane /= np.where(length > 1e-6, length, 1.0)
-    plane[0, np.bincount(flat, minlength=size) == 0] = 1.0
-    # A voxel that solids fill up to its faces blocks every ray: so do convex edges of aligned boxes, and ghosts.
-    shallow = np.full(size, -np.inf)
-    np.maximum.at(shallow, flat, offset)
-    several = np.bincount(flat, minlength=size) > 1
-    filled = (several & (shallow < -0.4)).reshape(padded)
-    plane = plane.reshape(4, *padded)
-    plane[:, filled | ghost] = np.array([-1.0, 0.0, 0.0, 0.0])[:, None]
+    # A voxel that solids fill up to its faces blocks every ray: so do convex edges of aligned boxes.
+    shallow = np.full(count, -np.inf)
+    np.maximum.at(shallow, place, offset)
+    filled = (np.bincount(place, minlength=count) > 1) & (shallow < -0.4)
+    plane[:, filled] = np.array([-1.0, 0.0, 0.0, 0.0])[:, None]
     return plane
 
 

@@ -299,7 +299,7 @@ def _furnace(transport: Transport, leaving: Light) -> Light:
 
 @program
 def _outside(layout: Layout | Partition, voxels: Array) -> Array:
-    solid = layout.from_padded(layout.buried[None].astype(layout.plane.dtype))[0] > 0
+    solid = layout.from_padded(layout.buried[None].astype(layout.real))[0] > 0
     return jnp.where(solid, 0.0, voxels)
 
 
@@ -374,7 +374,7 @@ def _make_transport(
                 f"boundary: some rays are still going after {_MOST_LAPS} laps of a periodic axis; expected every ray to meet "
                 "a surface, an open side or an absorbing medium; close or open another side, or add absorption"
             )
-    ones = lambda *shape: as_jax(np.ones((1 if extinction is None else bands, *shape), layout.plane.dtype))
+    ones = lambda *shape: as_jax(np.ones((1 if extinction is None else bands, *shape), layout.real))
     links = None
     if area is not None and extinction is None and isinstance(layout, Layout) and worth_linking(layout, len(quadrature)):
         links = find_links(layout, ordinates)
@@ -384,7 +384,7 @@ def _make_transport(
     if area is not None:
         if uniform.voxels is not None:
             transport = dataclasses.replace(transport, coverage=_first(uniform.voxels))
-        factors, sums = _balance(transport, as_jax(area, layout.plane.dtype), uniform)
+        factors, sums = _balance(transport, as_jax(area, layout.real), uniform)
         transport = dataclasses.replace(transport, factors=factors)
         if links is not None:  # those of voxels, of both in one sweep
             uniform, sums = _parted(_furnace(transport, _one_above_the_other(unit, factors)))

@@ -192,6 +192,14 @@ class _InBlocks(eqx.Module):
         return self.fields.plane
 
     @property
+    def real(self) -> np.dtype:
+        return np.dtype(self.fields.plane.dtype)
+
+    @property
+    def free(self) -> Bool[Array, "X Y Z"]:
+        return self.plane[0] == 1.0
+
+    @property
     def wide(self) -> bool:
         """Not so: rays also cross from block to block."""
         return False
@@ -240,7 +248,7 @@ class Partition(_InBlocks):
 
     def place(self, field: np.ndarray) -> Float[Array, "nx ny nz"]:
         """A known field in the shape of stored ones."""
-        return put(self.shapes.mesh, np.asarray(field, self.plane.dtype), Spec(*NAMES))
+        return put(self.shapes.mesh, np.asarray(field, self.real), Spec(*NAMES))
 
     def cut(self, ordinates: tuple[Ordinates, ...]) -> tuple[Ordinates, ...]:
         """Directions whose hits are marked on the whole layout, as blocks read them; the same on all devices but for marks."""

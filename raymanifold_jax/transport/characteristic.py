@@ -113,8 +113,9 @@ def fields_along(layout: Layout | Block, axis: int, surface: Float[Array, "C X Y
     The fields, which planes hold surfaces, and with `inflow` the image numbers of open ghost voxels.
     """
     planes = lambda field, fill=0: layout.planes(field, axis, fill)
+    surfaces = layout.plane
     fields = Fields(
-        geometry=(planes(layout.plane[0], -1), *(planes(layout.plane[1 + a]) for a in AXES[axis])),
+        geometry=(planes(surfaces[0], -1), *(planes(surfaces[1 + a]) for a in AXES[axis])),
         exitance=planes(surface),
         extinction=None if medium is None else planes(medium.extinction),
         source=None if medium is None else planes(medium.source),
@@ -216,7 +217,7 @@ def count_laps(
 ) -> tuple[tuple[Ordinates, ...], Int[Array, ""]]:
     """How often rays must go around each periodic axis until less than 1e-6 of their light is left; and the most of these."""
     bands = 1 if extinction is None else extinction.shape[0]
-    dark = jnp.zeros((bands, *layout.padded), layout.plane.dtype)
+    dark = jnp.zeros((bands, *layout.padded), layout.real)
     medium = None if extinction is None else SweptMedium(extinction, dark)
 
     def chunk_laps(track: Track, own: Ordinates):

@@ -212,7 +212,7 @@ def _view(seen, plane_number, reads: Reads, bits, own: Ordinates, starts, chords
 
 def _all_views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: Int[np.ndarray, "X Y Z"]) -> Iterator[_View]:
     """In vacuum, chunk by chunk, which voxels' surfaces each read of an element sees, by their `numbers` (1 and up)."""
-    codes = as_jax(numbers, layout.plane.dtype)[None]
+    codes = as_jax(numbers, layout.real)[None]
     for axis, (own, reads) in enumerate(zip(ordinates, layout.reads, strict=True)):
         if own.weight.shape[0] == 0:
             continue

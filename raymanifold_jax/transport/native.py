@@ -248,7 +248,7 @@ def views(layout: Layout, ordinates: tuple[Ordinates, ...], numbers: np.ndarray)
     from . import machine_code as code
     from .derivative import Manner
 
-    real = np.dtype(layout.plane.dtype)
+    real = layout.real
 
     def along(axis: int, line: _Axis, arguments: tuple, how: machine_code.Manner) -> list[list[tuple[np.ndarray, ...]]]:
         planes, cut, hits, probes = arguments
@@ -520,13 +520,13 @@ def _scattered(values: np.ndarray, layout: Layout, at: tuple[np.ndarray, np.ndar
 
 def _factor(layout: Layout, line: _Axis, inflow: Inflow | None, bands: int) -> np.ndarray:
     if inflow is None or inflow.factor is None:
-        return np.ones((bands, len(line.ghosts.cell)), layout.plane.dtype)
+        return np.ones((bands, len(line.ghosts.cell)), layout.real)
     return _gathered(np.asarray(inflow.factor), layout, line.at_ghost, len(line.ghosts.cell))
 
 
 def _axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
     assert own.hit_bits is not None  # by mark_hits
-    return keep((layout.plane, own.weight, own.laps, own.hit_bits), ("axis", axis), lambda: _make_axis(layout, own, axis))
+    return keep((layout.cut_plane, own.weight, own.laps, own.hit_bits), ("axis", axis), lambda: _make_axis(layout, own, axis))
 
 
 def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
@@ -539,18 +539,24 @@ def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
     ghost = np.ones(layout.padded, bool)
     ghost[tuple(slice(p, n - p) for p, n in zip(layout.pad, layout.padded, strict=True))] = False
     ghost = turned(ghost)
-    planes = np.asarray(layout.plane)
-    plane = [turned(planes[row]) for row in (0, *(1 + a for a in order))]
-    surface = (plane[0] != 1.0) & ~ghost
-    real = planes.dtype
-    cut = _cells(code, surface, plane, None, real)
-    ghosts = _cells(code, ghost, None, turned(layout.inflow_image), real)
-    number = np.full(count * height * width, -1)
+
+    def along(cell: Array) -> np.ndarray:
+        """Numbers of voxels on the planes of this axis."""
+        voxel = np.unravel_index(np.asarray(cell), layout.padded)
+        return (voxel[order[0]] * height + voxel[order[1]]) * width + voxel[order[2]]
+
+    home, rim = along(layout.cut_cell), np.nonzero(ghost.ravel())[0]
+    surface = np.zeros(ghost.shape, bool)
+    surface.ravel()[home] = True
+    by_place = np.argsort(home)
+    cut = _cells(code, home[by_place], shape, np.asarray(layout.cut_plane)[[0, *(1 + a for a in order)]][:, by_place])
+    image = np.full(len(rim), -1)
+    image[np.searchsorted(rim, along(layout.open_cell))] = np.asarray(layout.open_image)
+    ghosts = _cells(code, rim, shape, np.zeros((4, 0), layout.real), image)
+    number = np.full(ghost.size, -1)
     for cells in (cut, ghosts):
         number[_flat(cells, height * width)] = np.arange(len(cells.cell))
-    # Where each element image is: on planes of this axis.
-    voxel = np.unravel_index(np.asarray(layout.cell), layout.padded)
-    home = (voxel[order[0]] * height + voxel[order[1]]) * width + voxel[order[2]]
+    home = along(layout.cell)  # of each element image
     in_ghost = ghost.ravel()[home]
     at = lambda image: (image, number[home[image]])
     chunk, place = np.nonzero(np.asarray(own.weight) != 0)
@@ -577,15 +583,15 @@ def _shared(numbers: np.ndarray) -> tuple[np.ndarray, ...]:
 
 def _lit(layout: Layout, line: _Axis, axis: int, inflow: Inflow | None) -> Int[np.ndarray, " n"]:
     """Of the directions those in which light comes in, where it comes from nowhere else."""
-    ways, is_open = line.ways, np.asarray(layout.inflow_image) >= 0
+    ways, voxel = line.ways, np.unravel_index(np.asarray(layout.open_cell), layout.padded)
     numbers = _by_sense(ways)
     if inflow is None:
         return numbers[:0]
     shines = (np.asarray(inflow.radiance) != 0).any((0, 2))[ways.index]
     enters = np.zeros(len(shines), bool)
     for place, a in enumerate(AXES[axis]):
-        for end, inward in ((0, 1), (-1, -1)):
-            if layout.pad[a] and is_open.take(end, a).any():
+        for end, inward in ((0, 1), (layout.padded[a] - 1, -1)):
+            if layout.pad[a] and (voxel[a] == end).any():
                 enters |= inward * ways.toward[:, place] > 0
     return numbers[(shines & enters)[numbers]]
 
@@ -594,16 +600,14 @@ def _flat(cells: machine_code.Cells, area: int) -> np.ndarray:
     return np.repeat(np.arange(len(cells.first) - 1), np.diff(cells.first)) * area + cells.cell
 
 
-def _cells(code, chosen: np.ndarray, plane, image: np.ndarray | None, real: np.dtype) -> machine_code.Cells:
-    number, cell = np.nonzero(chosen)
-    first = np.concatenate([[0], np.cumsum(np.bincount(number, minlength=len(chosen)))])
-    none = np.zeros((4, 0), real)
+def _cells(code, home: np.ndarray, shape: tuple[int, int, int], plane: np.ndarray, image: Any = ()) -> machine_code.Cells:
+    number, cell = np.divmod(home, shape[1] * shape[2])
     return code.Cells(
-        first=first,
+        first=np.searchsorted(number, np.arange(shape[0] + 1)),
         cell=cell.astype(np.uint32),
-        plane=none if plane is None else np.array([values[number, cell] for values in plane], real),
-        extinction=none,
-        image=np.zeros(0, int) if image is None else image[number, cell].astype(int),
+        plane=plane,
+        extinction=plane[:, :0],
+        image=np.array(image, int),
     )
 
 
@@ -697,7 +701,7 @@ def _medium(layout: Layout, line: _Axis, axis: int, extinction, bands: int, real
         free = np.full((count, bands), code.EVEN), np.zeros((count, bands))
         return _Medium(False, *free, np.zeros((1, 1, 1), real), nothing, (reader, reader))
     name = "medium", axis, id(line.hits.bits)
-    return keep((layout.plane, extinction), name, lambda: _make_medium(line, axis, extinction, real))
+    return keep((layout.cut_plane, extinction), name, lambda: _make_medium(line, axis, extinction, real))
 
 
 def _make_medium(line: _Axis, axis: int, extinction: Float[Array, "C X Y Z"], real: np.dtype) -> _Medium:

@@ -45,7 +45,7 @@ def source_slopes(
 
     `albedo` is what the source is of J, factors included that balance the exchange of power.
     """
-    scatters = (albedo > 0) & (layout.plane[0] == 1.0)
+    scatters = (albedo > 0) & layout.free
     mean = jnp.where(scatters, source / jnp.where(scatters, albedo, 1.0), 0.0)
     strength = jnp.where(scatters, albedo * flattening(extinction * layout.spacing, albedo), 0.0)
     there = scatters.astype(source.dtype)
