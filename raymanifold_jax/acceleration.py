@@ -65,13 +65,13 @@ def _level(links: list[Array], loss: Array) -> _Level:
     return _Level((links[0], links[1], links[2]), loss, _DAMPING / diagonal)
 
 
-class _Matrix(NamedTuple):
+class _Matrix(eqx.Module):
     """A level made ready to be applied many times: XLA works with parts of one array four times as fast as with moved ones."""
 
     links: tuple[Array, Array, Array]  # to each voxel from the one before, and one more
     loss: Array
     smoothing: Array
-    periodic: Axes
+    periodic: Axes = eqx.field(static=True)
 
     @classmethod
     def of(cls, level: _Level, periodic: Axes) -> _Matrix:
@@ -105,7 +105,7 @@ def _extended(field: Array, periodic: Axes, widths: tuple[tuple[int, int], ...])
 class _Second(NamedTuple):
     """The second step, where sources have slopes."""
 
-    levels: tuple[_Level, ...]
+    levels: tuple[_Level | _Matrix, ...]
     kept: Float[Array, "C nx ny nz"]  # weight of what a voxel has from the first
     bend: Float[Array, "C E"]  # conductance to the elements
 
@@ -113,7 +113,7 @@ class _Second(NamedTuple):
 class Diffusion(eqx.Module):
     """M of the module's docstring, for one scene and its albedos."""
 
-    levels: tuple[_Level, ...]
+    levels: tuple[_Level | _Matrix, ...]
     second: _Second | None
     power: Light  # g
     albedo: Light  # R
@@ -199,8 +199,8 @@ def _where(probe: Int[Array, " E"], shape: tuple[int, ...]) -> tuple[Array, ...]
     return jnp.unravel_index(probe, shape[1:])
 
 
-def _conjugate_gradients(near: Diffusion, levels: tuple[_Level, ...], right: Array) -> Array:
-    matrices = tuple(_Matrix.of(level, near.periodic) for level in levels)
+def _conjugate_gradients(near: Diffusion, levels: tuple[_Level | _Matrix, ...], right: Array) -> Array:
+    matrices = tuple(level if isinstance(level, _Matrix) else _Matrix.of(level, near.periodic) for level in levels)
     dot = lambda a, b: jnp.sum(a * b, axis=(1, 2, 3), keepdims=True)
     ratio = lambda a, b: jnp.where(b > 0, a / jnp.where(b > 0, b, 1.0), 0.0)
 
@@ -289,7 +289,7 @@ def make_diffusion(transport: Transport, surfaces: Surfaces, stuff: Materials) -
     area = surfaces.area / layout.spacing**2  # powers are in units of a voxel's face
     return _assemble(
         stuff, place(free), place(1 / (_FREE_PATH * ends)), as_jax(area), as_jax(flat, np.int32),
-        layout.spacing, (0 in periodic, 1 in periodic, 2 in periodic), transport.albedo is not None,
+        layout.spacing, (0 in periodic, 1 in periodic, 2 in periodic), transport.albedo is not None, isinstance(layout, Layout),
     )  # fmt: skip
 
 
@@ -307,7 +307,7 @@ def _distance(solid: np.ndarray, surfaces: Surfaces, shape: tuple[int, int, int]
 
 
 @program
-def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodic: Axes, sloped: bool) -> Diffusion:
+def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodic: Axes, sloped: bool, whole: bool) -> Diffusion:
     real, bands = stuff.albedo.dtype, stuff.albedo.shape[0]
     free, ends, area = (x.astype(real) for x in (free, ends, area))
     extinction = 0.0 if stuff.extinction is None else stuff.extinction * spacing
@@ -332,19 +332,20 @@ def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodi
     deep, bend = depth[:, *at_probe], straight[:, *at_probe]
     coupling = 2 * of_elements / (1 + jnp.minimum(deep, 1.0))
     beside = 2 / jnp.pi * of_elements * bend  # half as far as to the next voxel
-    whole = of_elements * (1 - stuff.albedo) + coupling * stuff.albedo
-    taken = coupling * of_elements * (1 - stuff.albedo) / whole
+    taken = coupling * of_elements * (1 - stuff.albedo) / (of_elements * (1 - stuff.albedo) + coupling * stuff.albedo)
     loss = (power * (1 - scattering)).at[:, *at_probe].add(taken)
     # Nothing happens in voxels inside solids; and a matrix that nearly is singular must not be.
     links_of = sum((link + jnp.roll(link, 1, axis) for axis, link in enumerate(links, start=1)), start=jnp.zeros_like(loss))
     loss = jnp.where(links_of + loss > 0, loss + 8 * jnp.finfo(real).eps * links_of, 1.0)
+    # One plane more does not part evenly into the blocks of a mesh: there it is added each time.
+    ready = lambda levels: tuple(_Matrix.of(level, periodic) for level in levels) if whole else levels
     second = None
     if sloped:
         kept = 16 * (1 / (3 * total) + (1 - straight) / 4)
-        second = _Second(_levels(bends, kept.at[:, *at_probe].add(beside)), kept, beside)
+        second = _Second(ready(_levels(bends, kept.at[:, *at_probe].add(beside))), kept, beside)
     voxels = None if stuff.scattering_albedo is None else power
     return Diffusion(
-        _levels(links, loss), second, Light(of_elements, voxels), Light(stuff.albedo, stuff.scattering_albedo), probe, coupling,
+        ready(_levels(links, loss)), second, Light(of_elements, voxels), Light(stuff.albedo, stuff.scattering_albedo), probe, coupling,
         periodic,
     )  # fmt: skip
 

@@ -23,18 +23,18 @@ from pathlib import Path
 
 from .threads import count_cores
 
-PROGRAM = 430_000_000  # Python, JAX, programs; a first start, which compiles them, takes 0 to 170 MB more
+PROGRAM = 485_000_000  # Python, JAX, programs; a first start, which compiles them, takes 0 to 170 MB more
 SWEEPS = 150_000_000  # compilation of XLA's sweeps
-BAND = 50_000_000  # work arrays of a batch
+BAND = 40_000_000  # work arrays of a batch
 GEOMETRY = 30  # words a voxel: planes, the samples of the signed distance, copies turned to each axis
 FIELDS_VACUUM = 11  # words a voxel and band: sums of a sweep, fluence of sun, sky and bounces
-FIELDS_MEDIUM = 65  # the same, coefficients, source, the multigrid's, and the iteration's unknowns of many sweeps
+FIELDS_MEDIUM = 56  # the same, coefficients, source, the multigrid's, and the iteration's unknowns of many sweeps
 BUFFERS = 32  # words a voxel
 ROWS = 20  # planes of rays: of four directions and what they need while they pass four at a time
 LINKS = 13  # bytes an element and direction, half of which come from behind it, while they are sorted; 8 of 20 remain
 MOST_LINKS = 1 << 30  # bytes: more are not made
 LARGE = 1 << 22  # bytes of an array: smaller ones are not worth giving back
-HELD = 0.65  # of large fields' memory, beside all that ever is allocated
+HELD = 0.55  # of large fields' memory, beside all that ever is allocated
 ELEMENT = 1000  # bytes an element: its rows in each axis's reads, position, material
 
 Shape = tuple[int, int, int]
