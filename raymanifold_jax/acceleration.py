@@ -307,7 +307,9 @@ def _distance(solid: np.ndarray, surfaces: Surfaces, shape: tuple[int, int, int]
 
 
 @program
-def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodic: Axes, sloped: bool, whole: bool) -> Diffusion:
+def _assemble(
+    stuff: Materials, free, ends, area, probe, spacing: float, periodic: Axes, sloped: bool, one_device: bool
+) -> Diffusion:
     real, bands = stuff.albedo.dtype, stuff.albedo.shape[0]
     free, ends, area = (x.astype(real) for x in (free, ends, area))
     extinction = 0.0 if stuff.extinction is None else stuff.extinction * spacing
@@ -338,16 +340,14 @@ def _assemble(stuff: Materials, free, ends, area, probe, spacing: float, periodi
     links_of = sum((link + jnp.roll(link, 1, axis) for axis, link in enumerate(links, start=1)), start=jnp.zeros_like(loss))
     loss = jnp.where(links_of + loss > 0, loss + 8 * jnp.finfo(real).eps * links_of, 1.0)
     # One plane more does not part evenly into the blocks of a mesh: there it is added each time.
-    ready = lambda levels: tuple(_Matrix.of(level, periodic) for level in levels) if whole else levels
+    ready = lambda levels: tuple(_Matrix.of(level, periodic) for level in levels) if one_device else levels
     second = None
     if sloped:
         kept = 16 * (1 / (3 * total) + (1 - straight) / 4)
         second = _Second(ready(_levels(bends, kept.at[:, *at_probe].add(beside))), kept, beside)
     voxels = None if stuff.scattering_albedo is None else power
-    return Diffusion(
-        ready(_levels(links, loss)), second, Light(of_elements, voxels), Light(stuff.albedo, stuff.scattering_albedo), probe, coupling,
-        periodic,
-    )  # fmt: skip
+    powers, albedos = Light(of_elements, voxels), Light(stuff.albedo, stuff.scattering_albedo)
+    return Diffusion(ready(_levels(links, loss)), second, powers, albedos, probe, coupling, periodic)
 
 
 def _levels(links: list[Array], loss: Array) -> tuple[_Level, ...]:

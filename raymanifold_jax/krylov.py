@@ -24,15 +24,15 @@ from .operator import Light
 from .programs import program
 
 _INDEPENDENT = 1e-6  # of the first residual: less than this of a new direction is rounding
-_QUICK = 4  # steps after which it is time to begin anew, with a medium, if each has at least halved the residual
+_QUICK = 4  # steps at least, with a medium, that halve the residual on average, before it is time to begin anew
 
 
 class Subspace:
     """What GMRES knows after some steps from a residual `start`.
 
     `apply(z)` returns (what to keep of z, K z). `residual` is what is left of `start`; `gain()` the same combination of what
-    was kept as x is of the z; `exhausted`: time to begin anew from there. That is after `size` steps, where no step can help,
-    and, to keep fewer fields of voxels, where the residual falls quickly anyway.
+    was kept as x is of the z. It is `done`, and time to begin anew from there, after `size` steps, where no step can help, and,
+    to keep fewer fields of voxels, where the residual falls quickly anyway.
     """
 
     def __init__(self, apply: Callable[[Light], tuple[Light, Light]], start: Light, size: int, precondition: Callable):
@@ -42,7 +42,7 @@ class Subspace:
         self._kept: list[Light] = []
         self._hessenberg = np.zeros((size + 1, size))
         self._weights = np.zeros(0)
-        self.residual, self.exhausted = start, False
+        self.residual, self.done = start, False
 
     def step(self) -> None:
         k = len(self._kept)
@@ -61,7 +61,7 @@ class Subspace:
         self.residual = self._combined(left, self._basis)
         quick = passed.voxels is not None and k + 1 >= _QUICK and np.linalg.norm(left) <= 0.5 ** (k + 1) * self._length
         alike = hessenberg[k + 1, k] <= _INDEPENDENT * abs(hessenberg[: k + 1, k]).max()
-        self.exhausted = quick or k + 1 == self._size or bool(alike)
+        self.done = quick or k + 1 == self._size or bool(alike)
 
     def gain(self) -> Light:
         return self._combined(self._weights, self._kept)
@@ -97,7 +97,7 @@ def linear_solve(
         while True:
             space.step()
             count += 1
-            if space.exhausted or count >= most or good(space.residual):
+            if space.done or count >= most or good(space.residual):
                 break
         solution, residual = solution + space.gain(), space.residual
     return solution, residual, count

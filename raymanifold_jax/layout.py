@@ -128,7 +128,7 @@ class Layout(eqx.Module):
 
     @property
     def real(self) -> np.dtype:
-        """Of its numbers."""
+        """The dtype of its real numbers."""
         return np.dtype(self.cut_plane.dtype)
 
     @property
@@ -193,8 +193,11 @@ def _spread_out(cell: Int[Array, " J"], values: Array, inside: tuple, rim: tuple
     """Few voxels' values [K, J] on the padded lattice, where all others inside have the same, and all at the rim."""
     widths = [(p, p) for p in pad]
     shape = tuple(n - 2 * p for n, p in zip(padded, pad, strict=True))
-    fields = [jnp.pad(jnp.full(shape, i, values.dtype), widths, constant_values=r) for i, r in zip(inside, rim, strict=True)]
-    return jnp.stack(fields).reshape(len(fields), -1).at[:, cell].set(values).reshape(-1, *padded)
+    rows = []  # one by one, which XLA takes to
+    for own, i, r in zip(values, inside, rim, strict=True):
+        field = jnp.pad(jnp.full(shape, i, values.dtype), widths, constant_values=r).ravel()
+        rows.append(field.at[cell].set(own, unique_indices=True, indices_are_sorted=True).reshape(padded))
+    return jnp.stack(rows)
 
 
 def flat_planes(field: Float[Array, "*C X Y Z"], axis: int) -> Float[Array, "K *C P"]:

@@ -7,9 +7,10 @@ The need in bytes, with V voxels (a layer of ghosts included), C bands, E surfac
 P is the voxels of the largest plane, of which each core keeps rays. C D: the bits that say which directions hit an element.
 Without a medium there are also links from element to element (see `transport.links`), at most LINKS E D and usually half of
 that, if these are not more than MOST_LINKS. Of fields that are LARGE only HELD are there at a time, as what is freed is given
-back (`give_back_freed`). Where sweeps are XLA's (see `transport.native`), it is not, there are SWEEPS bytes and BUFFERS words
-a voxel more, and the links are longer on their way. The constants are for 32-bit numbers; with them the peaks of ring and
-three balls (32 to 160 cubed) and of the Cornell box (32) come out within 20 %, of first and of later starts.
+back (`give_back_freed`). Where sweeps are XLA's (see `transport.native`), it is not between them, there are SWEEPS bytes and
+BUFFERS words a voxel more, and the links are longer on their way. The constants are for 32-bit numbers; with them the peaks of
+ring and three balls (32 to 160 cubed), the room (32, 64) and the Cornell box (32) come out within 20 %, of first and of later
+starts. The two processes that compile loops at the very first (`transport.machine_code`) are not counted.
 
 Public names: `estimate_memory`, `available_memory`, `check_memory`, `give_back_freed`, `gigabytes`.
 """
@@ -26,7 +27,7 @@ from .threads import count_cores
 PROGRAM = 485_000_000  # Python, JAX, programs; a first start, which compiles them, takes 0 to 170 MB more
 SWEEPS = 150_000_000  # compilation of XLA's sweeps
 BAND = 40_000_000  # work arrays of a batch
-GEOMETRY = 30  # words a voxel: planes, the samples of the signed distance, copies turned to each axis
+GEOMETRY = 30  # words a voxel: the samples of the signed distance, copies turned to each axis
 FIELDS_VACUUM = 11  # words a voxel and band: sums of a sweep, fluence of sun, sky and bounces
 FIELDS_MEDIUM = 56  # the same, coefficients, source, the multigrid's, and the iteration's unknowns of many sweeps
 BUFFERS = 32  # words a voxel

@@ -95,6 +95,8 @@ def solve(
       the solution. Not under `jit` and `vmap`.
     - `progress`: True or None shows a bar on a terminal when the solve takes long; False never; or a `Progress`.
 
+    With the extra `fast`, two other processes compile loops for up to a minute at the very first solve of an installation.
+
     **Raises** `ValueError` or `TypeError` for unusable arguments, traced shapes among them, before any work; `RuntimeError`
     with `throw`.
     """
@@ -108,7 +110,7 @@ def solve(
     if prepared is None:
         let_go()
     check_memory(scene.lattice.shape, scene.bands, len(quadrature), scene.medium is not None)
-    if mesh is None and cube is None and not on_accelerator():
+    if mesh is None and cube is None and not on_accelerator() and not checks.is_traced(scene.medium):
         native.compile_aside(real_dtype(), scene.medium is not None)
     meter = make_progress(progress)
     with meter:

@@ -70,7 +70,8 @@ def _add(total: Light, lost: Light, order: Light) -> tuple[Light, Light]:
 class Krylov(eqx.Module):
     """GMRES on (I - K) x = b, restarted after `restart` sweeps; 2 `restart` + 1 fields more.
 
-    With a medium it begins anew after four sweeps if each has halved the residual: that takes no more sweeps, and 9 fields.
+    With a medium it begins anew as soon as four sweeps or more have halved the residual on average: that takes no more sweeps,
+    and mostly 9 fields.
 
     With `diffusion`, preconditioned by it (`acceleration`): nearly the same number of sweeps at any albedo and optical depth.
     """
@@ -91,7 +92,7 @@ class Krylov(eqx.Module):
         precondition = iteration.system.precondition if self.diffusion else lambda light: light
         begun = iteration.arriving
         space = Subspace(iteration.system.bounce, iteration.residual, self.restart, precondition)
-        while not (iteration.over or space.exhausted):
+        while not (iteration.over or space.done):
             space.step()
             iteration.reach(begun + space.gain(), space.residual)
             if iteration.close:

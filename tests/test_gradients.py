@@ -225,7 +225,7 @@ def test_adjoint_sweeps(fog, sides, x64):
     forward = lambda s, *sent: swept(manner, *known, s, *sent)
     backward = lambda s, *asked: unswept(manner, *known, s, *asked, thick)
     elements, voxels = (lambda: random(2, len(surfaces))), (lambda: random(2, *shape))
-    free = layout.plane[0] == 1.0  # CUT voxels have no slopes
+    free = layout.free  # CUT voxels have no slopes
     slopes = tuple(free * (random(2, *layout.padded) - 0.5) for _ in range(3)) if thick else None
     light = Inflow(random(images, len(QUADRATURE), 2), elements())
     sloped = lambda a: free if a.shape[1:] == layout.padded else 1.0

@@ -6,6 +6,7 @@ Numbers in solids are left out: nobody reads them, and rays there are not the sa
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import subprocess
 import sys
 import threading
@@ -288,31 +289,45 @@ def test_processes_compile_one_at_a_time(folder):
 
 
 def test_loops_take_what_they_are_said_to_take():
-    for medium in (rm.Medium(2.0, 0.1), None):
-        rm.solve(_box(medium, _ROOM, (3, 3, 3)), rm.quadrature.fibonacci(12), progress=False)
+    for x64, medium in itertools.product((False, True), (rm.Medium(2.0, 0.1), None)):
+        with jax.enable_x64(x64):
+            rm.solve(_box(medium, _ROOM, (3, 3, 3)), rm.quadrature.fibonacci(12), progress=False)
     for loop in (getattr(machine_code, name) for name in machine_code.__all__):
         if isinstance(loop, kept.Loop):
-            examples = [loop.examples(np.dtype(real)) for real in (np.float32, np.float64)]
-            said = {tuple(kept._take_apart(argument, []) for argument in each) for each in examples}
-            assert loop._ready and set(loop._ready) <= said, loop.name
+            said = {kept.form_of(loop.examples(np.dtype(real))) for real in (np.float32, np.float64)}
+            assert set(loop._ready) == said, loop.name
 
 
 def test_loops_are_compiled_by_processes_of_their_own(monkeypatch, folder):
+    fcntl = pytest.importorskip("fcntl", reason="locks of files")
     commands, process = [], subprocess.Popen([sys.executable, "-c", ""])
     monkeypatch.setattr(kept.subprocess, "Popen", lambda command, **_: commands.append(command) or process)
     monkeypatch.setattr(kept, "count_cores", lambda: 2)
     loops = machine_code.tally, machine_code.follow
-    kept.compile_aside(np.dtype(float), loops, ())
-    kept._have("<f8", ["tally"])
+    begun = lambda real=float: (commands.clear(), kept.compile_aside(np.dtype(real), loops, ()), len(commands))[-1]
+    assert begun() == 1
+    kept._compile("<f8", ["tally"])
     assert {file.name for file in folder.glob("*.loop")} == {machine_code.tally.file(*[np.zeros(1, np.int32)] * 2).name}
-    kept.compile_aside(np.dtype(float), loops)  # of which one is there
-    kept._have("<f8", ["follow"])
-    kept.compile_aside(np.dtype(float), loops)  # nothing to do
+    assert begun() == 1  # one is there, the other is not
+    command = commands[0]
+    follow = machine_code.follow.file(*machine_code.follow.examples(np.dtype(float)))
+    with follow.with_suffix(".lock").open("a") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        kept._compile("<f8", ["follow"])  # somebody else is about to
+        assert not follow.exists()
+    kept._compile("<f8", ["follow"])
+    assert follow.exists() and begun() == 0
+    for name, value in {"executable": "/usr/bin/another", "frozen": True}.items():
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, name, value, raising=False)
+            assert begun(np.float32) == 0
+    folder.chmod(0o777)  # others may write there: nothing of it is used
+    assert begun(np.float32) == 0
+    folder.chmod(0o700)
     monkeypatch.setattr(kept, "count_cores", lambda: 1)
-    kept.compile_aside(np.dtype(np.float32), loops)
-    assert len(commands) == 2
+    assert begun(np.float32) == 0
     monkeypatch.undo()
-    done = subprocess.run(commands[0], capture_output=True, text=True, timeout=300)  # beside the sources, as these are kept
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)  # beside the sources, as these are kept
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 

@@ -62,7 +62,8 @@ def compile_aside(real: np.dtype, medium: bool) -> None:
         return
     from . import machine_code as code
 
-    # Those that take long in groups of about the same length; what is needed first, first.
+    # In groups that take about as long; what is needed first, first. (Vacuum with too many links needs others, which then are
+    # compiled when they are called.)
     if medium:
         code.compile_aside(real, (code.forwards,), (code.mark, code.pack, code.backwards))
     else:

@@ -12,7 +12,7 @@ As those of programs (`program_files`), the files are code: they lie beside the 
 
 What a solve will need can be compiled ahead, by processes of their own: one compiles a single loop at a time.
 
-Public: `Loop`, `get_ready`, `compile_aside`.
+Public: `Loop`, `get_ready`, `compile_aside`, `form_of`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import AbstractArray, Float, Shaped
 
 from ...program_files import is_own, user_cache, write_whole
 from ...threads import count_cores
@@ -79,27 +79,33 @@ class Loop:
 
     def file(self, *arguments: Any) -> Path:
         """Where the loop is kept for such arguments."""
-        form = tuple(_take_apart(argument, []) for argument in arguments)
-        return _folder() / f"{self.name}-{_circumstances()}-{_digest(repr(form))}.loop"
+        return _folder() / f"{self.name}-{_circumstances()}-{_digest(repr(form_of(arguments)))}.loop"
 
     def examples(self, real: np.dtype) -> tuple:
         """Arguments of its types for fields of the type `real`, with nothing in them."""
         return tuple(_example(kind, real, self._carried or real) for kind in self._takes)
 
-    def have(self, real: np.dtype) -> None:
-        """Have it ready, and kept, for such fields."""
+    def compile_ahead(self, real: np.dtype) -> None:
+        """Have it kept for such fields, unless somebody else is about to."""
         arguments = self.examples(real)
-        self._find(tuple(_take_apart(argument, []) for argument in arguments), arguments)
+        file = self.file(*arguments)
+        with _alone(file, wait=False) as alone:
+            if alone and _read(file) is None:
+                self._make(file, form_of(arguments), arguments)
 
     def _find(self, form: Hashable, arguments: tuple) -> Callable[[list], int]:
         file = self.file(*arguments)
         found = _read(file)
         if found is None:
             with _alone(file):
-                found = _read(file) or self._compiled(form, arguments)
-                with contextlib.suppress(OSError):  # a full disk: the next process compiles as well
-                    write_whole(file, zlib.compress(pickle.dumps(found), 1))
+                found = _read(file) or self._make(file, form, arguments)
         return _loaded(*found)
+
+    def _make(self, file: Path, form: Any, arguments: tuple) -> tuple[str, list[str], bytes]:
+        made = self._compiled(form, arguments)
+        with contextlib.suppress(OSError):  # a full disk: the next process compiles as well
+            write_whole(file, zlib.compress(pickle.dumps(made), 1))
+        return made
 
     def _compiled(self, form: Any, arguments: tuple) -> tuple[str, list[str], bytes]:
         """Its name in the machine code, the types of what it takes, and the code."""
@@ -122,24 +128,26 @@ def get_ready() -> None:
 def compile_aside(real: np.dtype, *groups: Iterable[Loop]) -> None:
     """Have the loops of each group compiled, one after the other, by a process of its own, and go on meanwhile.
 
-    What is needed before it is ready is waited for. None is begun on a single core, nor where nothing can be kept.
+    What is needed before it is ready is waited for. Such a process may live on for a minute after this one. None is begun on a
+    single core, where nothing can be kept or locked, and where this is a program that only holds a Python.
     """
-    if count_cores() < 2 or fcntl is None or not (sys.executable and os.access(_folder(), os.W_OK)):
+    is_python = Path(sys.executable or "").name.lower().startswith("python") and not getattr(sys, "frozen", False)
+    if count_cores() < 2 or fcntl is None or not is_python or not (os.access(_folder(), os.W_OK) and _is_trusted(_folder())):
         return
     quiet = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.DEVNULL)
     for group in groups:
         missing = [loop.name for loop in group if not loop.file(*loop.examples(real)).exists()]
-        code = f"import sys; sys.path[:] = {sys.path}; from {__name__} import _have; _have({real.str!r}, {missing})"
+        code = f"import sys; sys.path[:] = {sys.path}; from {__name__} import _compile; _compile({real.str!r}, {missing})"
         if missing:
             with contextlib.suppress(OSError):
                 process = subprocess.Popen([sys.executable, "-c", code], **quiet)
                 threading.Thread(target=process.wait, daemon=True).start()  # so that nothing is left of it in the end
 
 
-def _have(real: str, names: list[str]) -> None:
+def _compile(real: str, names: list[str]) -> None:
     loops = sys.modules[__name__.rpartition(".")[0]]
     for name in names:
-        getattr(loops, name).have(np.dtype(real))
+        getattr(loops, name).compile_ahead(np.dtype(real))
 
 
 def _example(kind: Any, real: np.dtype, carried: np.dtype) -> Any:
@@ -147,10 +155,15 @@ def _example(kind: Any, real: np.dtype, carried: np.dtype) -> Any:
         return tuple(_example(part, real, carried) for part in get_args(kind))
     if hasattr(kind, "_fields"):
         return kind(*(_example(part, real, carried) for part in get_type_hints(kind).values()))
-    if hasattr(kind, "dims"):  # jaxtyping's
-        generic = {str(Float.dtypes): real, str(Shaped.dtypes): carried}  # pyright: ignore[reportAttributeAccessIssue]
-        return np.zeros((0,) * len(kind.dims), dtype=generic.get(str(kind.dtypes)) or kind.dtypes[0])
+    if issubclass(kind, AbstractArray):
+        own = real if kind.dtype is Float else carried if kind.dtype is Shaped else np.dtype(kind.dtypes[0])
+        return np.zeros((0,) * len(kind.dims), own)
     return kind(0)
+
+
+def form_of(arguments: tuple) -> tuple:
+    """The types of arguments, by which a loop is found."""
+    return tuple(_take_apart(argument, []) for argument in arguments)
 
 
 def _take_apart(value: Any, numbers: list[Any]) -> Any:
@@ -212,11 +225,15 @@ def _folder() -> Path:
 def _read(file: Path) -> tuple[str, list[str], bytes] | None:
     """What is kept in a file; None if there is nothing that can be trusted, or used."""
     try:
-        if file.parent != _HERE / "__pycache__" and not is_own(file.parent):
+        if not _is_trusted(file.parent):
             return None
         return pickle.loads(zlib.decompress(file.read_bytes()))  # with a checksum
     except (OSError, zlib.error):
         return None
+
+
+def _is_trusted(folder: Path) -> bool:
+    return folder == _HERE / "__pycache__" or is_own(folder)
 
 
 def _loaded(name: str, kinds: list[str], code: bytes) -> Callable[[list], int]:
@@ -245,14 +262,19 @@ def _loaded(name: str, kinds: list[str], code: bytes) -> Callable[[list], int]:
 
 
 @contextlib.contextmanager
-def _alone(file: Path) -> Iterator[None]:
+def _alone(file: Path, wait: bool = True) -> Iterator[bool]:
     """Hold a file's lock, which the system takes back from processes that die; none where files cannot be written or locked.
 
     Processes that start at once would each compile the same loops: so one of them does, and the others take what it has made.
+    False where another has it and this one does not `wait`.
     """
     with contextlib.ExitStack() as held:
+        alone = True
         with contextlib.suppress(OSError):
             lock = held.enter_context(file.with_suffix(".lock").open("a"))
             if fcntl is not None:
-                fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
+                try:
+                    fcntl.flock(lock, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+                except BlockingIOError:
+                    alone = False
+        yield alone
