@@ -5,7 +5,7 @@ doubled along their axis, only directions on one side of the mirror are swept, a
 axis the elements' *reads* are listed plane by plane, in tiles of equal size, so that one small loop serves any number of
 elements in a plane.
 
-Public: `Layout`, `make_layout`, `Ordinates`, `make_ordinates`.
+Public: `Layout`, `make_layout`, `ghosts`, `Ordinates`, `make_ordinates`.
 """
 
 from __future__ import annotations
@@ -244,8 +244,7 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
     flat = np.asarray(np.ravel_multi_index(tuple(voxel.T), padded)) if len(voxel) else np.zeros(0, int)
 
     area = surfaces.area[element]
-    ghost = np.ones(padded, bool)
-    ghost[tuple(slice(p, n - p) for p, n in zip(pad, padded, strict=True))] = False
+    ghost = ghosts(padded, pad)
     cells, place = np.unique(flat, return_inverse=True)
     weight = area / np.maximum(np.bincount(place, area, len(cells)), 1e-300)[place]
     inside = ~ghost.ravel()[cells]
@@ -282,6 +281,13 @@ def make_layout(scene: Scene, surfaces: Surfaces) -> Layout:
         open_image=as_jax(image_number[is_open][first], np.int32),
         reads=_all_reads(padded, [(rows, voxel), (probes, probe[probing])], real),
     )
+
+
+def ghosts(padded: tuple[int, int, int], pad: tuple[int, int, int]) -> Bool[np.ndarray, "X Y Z"]:
+    """The ghost voxels at the rim of a padded lattice."""
+    ghost = np.ones(padded, bool)
+    ghost[tuple(slice(p, n - p) for p, n in zip(pad, padded, strict=True))] = False
+    return ghost
 
 
 def _triple(values: Iterable[int]) -> tuple[int, int, int]:

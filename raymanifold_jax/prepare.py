@@ -27,7 +27,6 @@ from .placement import known
 from .scene import Scene
 from .surfaces import Surfaces, find_surfaces
 
-_FIELD = 4  # bytes a voxel of the fields that are made on the way
 _SMALL = 1 << 20  # voxels times bands, of which a solve keeps what it has made
 
 _lock = threading.Lock()
@@ -113,7 +112,6 @@ def prepare(scene: Scene) -> Prepared:
     # Known even while JAX traces values.
     with worked_out_now():
         surfaces = find_surfaces(scene)
-        give_back_freed(_FIELD * surfaces.solid.size)
-        prepared = Prepared(surfaces, make_layout(scene, surfaces))
-        give_back_freed(_FIELD * surfaces.solid.size)
-        return prepared
+        layout = make_layout(scene, surfaces)
+        give_back_freed(layout.real.itemsize * surfaces.solid.size)
+        return Prepared(surfaces, layout)

@@ -19,7 +19,7 @@ def test_fields_of_few_voxels(boundary, solids):
     ghost = np.ones(layout.padded, bool)
     ghost[tuple(slice(p, n - p) for p, n in zip(layout.pad, layout.padded, strict=True))] = False
     np.testing.assert_array_equal(plane[:, ghost], np.repeat([[-1.0], [0.0], [0.0], [0.0]], ghost.sum(), axis=1))
-    # Voxels with one element image have its plane; those with several none of theirs, but one; all others are free.
+    # Voxels with elements are not free; those with a single one have its plane.
     count = np.bincount(np.asarray(layout.cell), minlength=ghost.size).reshape(ghost.shape)
     np.testing.assert_array_equal(free, (count == 0) & ~ghost)
     np.testing.assert_array_equal(plane[:, free], np.repeat([[1.0], [0.0], [0.0], [0.0]], free.sum(), axis=1))

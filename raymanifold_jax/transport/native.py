@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int, UInt32
 from .. import checks
 from ..arrays import as_jax
 from ..keep import keep
-from ..layout import AXES, Layout, Ordinates, Reads
+from ..layout import AXES, Layout, Ordinates, Reads, ghosts
 from ..memory import give_back_freed
 from ..threads import count_cores
 from .characteristic import Inflow
@@ -536,10 +536,7 @@ def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
 
     order = AXES[axis]
     count, height, width = shape = layout.padded_along(axis)
-    turned = lambda field: np.asarray(field).transpose(order).reshape(count, -1)
-    ghost = np.ones(layout.padded, bool)
-    ghost[tuple(slice(p, n - p) for p, n in zip(layout.pad, layout.padded, strict=True))] = False
-    ghost = turned(ghost)
+    ghost = ghosts(layout.padded, layout.pad).transpose(order).reshape(count, -1)
 
     def along(cell: Array) -> np.ndarray:
         """Numbers of voxels on the planes of this axis."""
@@ -553,9 +550,9 @@ def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
     cut = _cells(code, home[by_place], shape, np.asarray(layout.cut_plane)[[0, *(1 + a for a in order)]][:, by_place])
     image = np.full(len(rim), -1)
     image[np.searchsorted(rim, along(layout.open_cell))] = np.asarray(layout.open_image)
-    ghosts = _cells(code, rim, shape, np.zeros((4, 0), layout.real), image)
+    at_rim = _cells(code, rim, shape, np.zeros((4, 0), layout.real), image)
     number = np.full(ghost.size, -1)
-    for cells in (cut, ghosts):
+    for cells in (cut, at_rim):
         number[_flat(cells, height * width)] = np.arange(len(cells.cell))
     home = along(layout.cell)  # of each element image
     in_ghost = ghost.ravel()[home]
@@ -568,7 +565,7 @@ def _make_axis(layout: Layout, own: Ordinates, axis: int) -> _Axis:
         for reads, bits, wanted in zip(layout.reads[axis].kinds, (own.hit_bits, own.probe_bits), (1, 0), strict=True)
     )
     parts = _shared(_by_sense(ways))
-    line = _contiguous((ways, parts, shape, cut, ghosts, ~surface & ~ghost, hits, probes))
+    line = _contiguous((ways, parts, shape, cut, at_rim, ~surface & ~ghost, hits, probes))
     return _Axis(*line, at(np.nonzero(~in_ghost)[0]), at(np.nonzero(in_ghost)[0]))
 
 
